@@ -1,0 +1,84 @@
+//! [`Frame`] (intensity Z and exposure time Δt) and [`Bracket`] (frames of one scene). No files.
+
+use crate::error::{Error, Result};
+use crate::image::Rgb;
+
+/// One photograph of the bracket.
+#[derive(Clone, Debug)]
+pub struct Frame {
+    /// How messages name the frame: its file name.
+    pub name: String,
+    /// Intensity Z in 0..=1 (1 is the file's largest code), three channels.
+    pub intensity: Rgb,
+    /// Number of intensity steps of the file: 255 for 8 bits, 65535 for 16 bits.
+    pub levels: u32,
+    /// Exposure time Δt in seconds.
+    pub exposure_time: f64,
+}
+
+/// Two or more frames of one scene, of one size, at more than one exposure time, in command-line order.
+#[derive(Clone, Debug)]
+pub struct Bracket {
+    frames: Vec<Frame>,
+}
+
+impl Bracket {
+    /// Checks that the frames make a bracket.
+    ///
+    /// # Errors
+    /// [`Error::Bracket`], naming the frame, for fewer than two frames, frames of different size, an exposure time
+    /// that is not a positive finite number, frames that all have the same exposure time, and frames that are all
+    /// clipped or all black.
+    pub fn new(frames: Vec<Frame>) -> Result<Self> {
+        if frames.len() < 2 {
+            return Err(Error::Bracket(format!(
+                "a bracket needs at least two frames, {} given; add frames with other exposure times",
+                frames.len()
+            )));
+        }
+        let size = frames[0].intensity.size();
+        for f in &frames {
+            if f.intensity.size() != size {
+                let (w, h) = f.intensity.size();
+                return Err(Error::Bracket(format!(
+                    "{}: is {w} x {h} pixels but {} is {} x {}; all frames must have one size",
+                    f.name, frames[0].name, size.0, size.1
+                )));
+            }
+            if !(f.exposure_time.is_finite() && f.exposure_time > 0.0) {
+                return Err(Error::Bracket(format!(
+                    "{}: exposure time {} s is not a positive number; give the times with --exposures",
+                    f.name, f.exposure_time
+                )));
+            }
+        }
+        let times = frames.iter().map(|f| f.exposure_time);
+        let (min, max) = times.fold((f64::INFINITY, 0.0f64), |(a, b), t| (a.min(t), b.max(t)));
+        if max / min < 1.01 {
+            return Err(Error::Bracket(format!(
+                "{}: all frames have the same exposure time ({min} s); a bracket needs at least two different ones, give the true times with --exposures",
+                frames[0].name
+            )));
+        }
+        for (what, test) in [("clipped", (|v: f32| v >= 1.0) as fn(f32) -> bool), ("black", |v: f32| v <= 0.0)] {
+            if frames.iter().all(|f| f.intensity.0.iter().all(|p| p.data.iter().all(|&v| test(v)))) {
+                return Err(Error::Bracket(format!(
+                    "{}: every pixel of every frame is {what}; take frames with {} exposure times",
+                    frames[0].name,
+                    if what == "clipped" { "shorter" } else { "longer" }
+                )));
+            }
+        }
+        Ok(Self { frames })
+    }
+
+    /// The frames in command-line order.
+    pub fn frames(&self) -> &[Frame] {
+        &self.frames
+    }
+
+    /// (width, height) of every frame.
+    pub fn size(&self) -> (usize, usize) {
+        self.frames[0].intensity.size()
+    }
+}

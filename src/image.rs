@@ -1,0 +1,130 @@
+//! Images in memory: [`Plane`] (one `f32` channel, row-major) and [`Rgb`] (three planes of one size).
+
+use crate::error::{Error, Result};
+
+/// One channel, `width * height` values, row-major, pixel centres at integers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plane {
+    /// Pixels per row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `width * height` values.
+    pub data: Vec<f32>,
+}
+
+impl Plane {
+    /// A plane of one value.
+    pub fn filled(width: usize, height: usize, value: f32) -> Self {
+        Self { width, height, data: vec![value; width * height] }
+    }
+
+    /// A plane whose value at (x, y) is `f(x, y)`.
+    pub fn from_fn(width: usize, height: usize, mut f: impl FnMut(usize, usize) -> f32) -> Self {
+        let mut data = Vec::with_capacity(width * height);
+        for y in 0..height {
+            for x in 0..width {
+                data.push(f(x, y));
+            }
+        }
+        Self { width, height, data }
+    }
+
+    /// Takes `data` as the pixels of a plane.
+    ///
+    /// # Errors
+    /// [`Error::Input`] when `data` does not hold `width * height` values.
+    pub fn from_vec(width: usize, height: usize, data: Vec<f32>) -> Result<Self> {
+        if data.len() != width * height {
+            return Err(Error::Input(format!("a {width} x {height} plane needs {} values, not {}", width * height, data.len())));
+        }
+        Ok(Self { width, height, data })
+    }
+
+    /// Value at (x, y).
+    #[inline]
+    pub fn at(&self, x: usize, y: usize) -> f32 {
+        self.data[y * self.width + x]
+    }
+
+    /// Value at (x, y), the nearest pixel's outside the plane.
+    #[inline]
+    pub fn clamped(&self, x: isize, y: isize) -> f32 {
+        self.at(x.clamp(0, self.width as isize - 1) as usize, y.clamp(0, self.height as isize - 1) as usize)
+    }
+
+    /// A new plane with `f` applied to each value.
+    pub fn map(&self, mut f: impl FnMut(f32) -> f32) -> Self {
+        Self { width: self.width, height: self.height, data: self.data.iter().map(|&v| f(v)).collect() }
+    }
+
+    /// A new plane with `f` applied to each pair of values.
+    ///
+    /// # Panics
+    /// When the sizes differ.
+    pub fn zip(&self, other: &Self, mut f: impl FnMut(f32, f32) -> f32) -> Self {
+        assert_eq!(self.size(), other.size(), "planes of one size");
+        Self { width: self.width, height: self.height, data: self.data.iter().zip(&other.data).map(|(&a, &b)| f(a, b)).collect() }
+    }
+
+    /// (width, height).
+    pub fn size(&self) -> (usize, usize) {
+        (self.width, self.height)
+    }
+
+    /// The `width` x `height` part whose first pixel is (x, y).
+    ///
+    /// # Panics
+    /// When the part leaves the plane.
+    pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Self {
+        assert!(x + width <= self.width && y + height <= self.height, "crop inside the plane");
+        Self::from_fn(width, height, |i, j| self.at(x + i, y + j))
+    }
+
+    /// The plane with `pad` more pixels on every side, each a copy of the nearest edge pixel.
+    pub fn padded(&self, pad: usize) -> Self {
+        Self::from_fn(self.width + 2 * pad, self.height + 2 * pad, |x, y| self.clamped(x as isize - pad as isize, y as isize - pad as isize))
+    }
+}
+
+/// Three planes of one size: red, green, blue.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rgb(pub [Plane; 3]);
+
+impl Rgb {
+    /// Image of one value in all channels.
+    pub fn filled(width: usize, height: usize, value: f32) -> Self {
+        Self(std::array::from_fn(|_| Plane::filled(width, height, value)))
+    }
+
+    /// (width, height).
+    pub fn size(&self) -> (usize, usize) {
+        self.0[0].size()
+    }
+
+    /// Pixels per row.
+    pub fn width(&self) -> usize {
+        self.0[0].width
+    }
+
+    /// Rows.
+    pub fn height(&self) -> usize {
+        self.0[0].height
+    }
+
+    /// `f` applied to each plane.
+    pub fn map_planes(&self, mut f: impl FnMut(&Plane) -> Plane) -> Self {
+        Self(std::array::from_fn(|c| f(&self.0[c])))
+    }
+
+    /// Mean of the three channels.
+    pub fn mean(&self) -> Plane {
+        let [r, g, b] = &self.0;
+        Plane::from_fn(self.width(), self.height(), |x, y| (r.at(x, y) + g.at(x, y) + b.at(x, y)) / 3.0)
+    }
+
+    /// Interleaved `[r, g, b]` of pixel `i` (row-major).
+    pub fn pixel(&self, i: usize) -> [f32; 3] {
+        std::array::from_fn(|c| self.0[c].data[i])
+    }
+}

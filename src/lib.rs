@@ -1,0 +1,26 @@
+//! Sharp HDR irradiance from a hand-held exposure bracket whose frames are blurred by camera shake.
+//!
+//! The method follows C. S. Vijay, C. Paramanand, A. N. Rajagopalan and R. Chellappa, "Non-Uniform Deblurring in HDR
+//! Image Reconstruction", IEEE Transactions on Image Processing 22(10), 2013 ("the paper"; equation numbers are its):
+//!
+//! 1. [`response`]: irradiance B = f⁻¹(Z)/Δt of each frame from its intensity Z and exposure time Δt (section II-A).
+//! 2. [`mask`] and [`noise`]: which pixels count (Tukey window, eq. 8) and how much (inverse variance).
+//! 3. [`triage`]: which frames are sharp.
+//! 4. [`psf`]: patches of each blurred frame and their local PSFs h against the sharp reference (eq. 11).
+//! 5. [`tsf`]: the transformation spread function h_T over poses Γ (eq. 2-6) from the PSFs, refined on the whole frame.
+//! 6. [`deblur`]: irradiance E that explains all frames, data term and total variation (eq. 9-10), by conjugate
+//!    gradients on the GPU; K and its exact adjoint Kᵀ are the [`kernels`].
+//! 7. [`pipeline`]: these stages in order, from [`exposure::Bracket`] to irradiance and report.
+
+pub mod cli;
+pub mod error;
+pub mod exposure;
+pub mod image;
+pub mod io;
+pub mod metrics;
+pub mod pipeline;
+pub mod pose;
+pub mod response;
+pub mod synth;
+pub mod tonemap;
+pub mod tsf;

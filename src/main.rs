@@ -1,0 +1,5 @@
+//! The `unshaken` program.
+
+fn main() -> std::process::ExitCode {
+    unshaken::cli::run()
+}

@@ -1,0 +1,90 @@
+//! Camera poses: [`Pose`], its homography Γ of eq. (2), and [`PoseGrid`], the sampled transformation space H.
+
+use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// One camera pose with its weight: the fraction of the exposure time that the camera spent there.
+///
+/// A pose maps the latent scene on the reference grid to the frame: pixels, x right, y down, pixel centres at
+/// integers, origin at the frame's centre ((W-1)/2, (H-1)/2); `p_frame = T(t_x, t_y) K R K^-1 p_scene` with
+/// `K = diag(F, F, 1)` and `R = exp(Φ)` of eq. (2).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Pose {
+    /// Translation to the right, pixels.
+    pub t_x: f64,
+    /// Translation down, pixels.
+    pub t_y: f64,
+    /// Pitch, degrees.
+    #[serde(default)]
+    pub theta_x_deg: f64,
+    /// Yaw, degrees.
+    #[serde(default)]
+    pub theta_y_deg: f64,
+    /// Roll, degrees.
+    #[serde(default)]
+    pub theta_z_deg: f64,
+    /// Fraction of the exposure time, 0..=1.
+    pub weight: f64,
+}
+
+impl Pose {
+    /// The pose that moves nothing, with weight 1.
+    pub const IDENTITY: Self = Self { t_x: 0.0, t_y: 0.0, theta_x_deg: 0.0, theta_y_deg: 0.0, theta_z_deg: 0.0, weight: 1.0 };
+
+    /// A pose of the paper's 3-D transformation space (t_x, t_y in pixels, θ_z in degrees).
+    pub fn planar(t_x: f64, t_y: f64, theta_z_deg: f64, weight: f64) -> Self {
+        Self { t_x, t_y, theta_z_deg, weight, ..Self::IDENTITY }
+    }
+
+    /// Γ of eq. (2) in centred pixel coordinates, for focal length `focal_px` in pixels.
+    pub fn homography(&self, focal_px: f64) -> DMat3 {
+        DMat3::from_translation(DVec2::new(self.t_x, self.t_y)) * self.rotation(focal_px)
+    }
+
+    /// `K R K^-1`: the rotational part of Γ.
+    pub fn rotation(&self, focal_px: f64) -> DMat3 {
+        let v = DVec3::new(self.theta_x_deg, self.theta_y_deg, self.theta_z_deg) * std::f64::consts::PI / 180.0;
+        let angle = v.length();
+        let r = if angle < 1e-15 { DMat3::IDENTITY } else { DMat3::from_axis_angle(v / angle, angle) };
+        let k = DMat3::from_diagonal(DVec3::new(focal_px, focal_px, 1.0));
+        let h = k * r * k.inverse();
+        h * (1.0 / h.z_axis.z)
+    }
+
+    /// Where Γ takes the scene point `p` (centred pixels).
+    pub fn apply(&self, focal_px: f64, p: DVec2) -> DVec2 {
+        project(&self.homography(focal_px), p)
+    }
+}
+
+/// `h p` with the perspective division.
+pub fn project(h: &DMat3, p: DVec2) -> DVec2 {
+    let q = *h * DVec3::new(p.x, p.y, 1.0);
+    DVec2::new(q.x / q.z, q.y / q.z)
+}
+
+/// The sampled transformation space H of section II-B: integer translations and equally spaced roll angles.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseGrid {
+    /// Translations are the integers of `-radius..=radius`, pixels, in x and in y.
+    pub radius: usize,
+    /// Roll angles θ_z in degrees, ascending, equally spaced.
+    pub angles_deg: Vec<f64>,
+}
+
+impl PoseGrid {
+    /// Grid with translations up to `radius` pixels and angles up to `max_deg`, whose angle step moves the farthest
+    /// pixel of a `width` x `height` frame by at most `corner_step` pixels.
+    pub fn new(width: usize, height: usize, radius: usize, max_deg: f64, corner_step: f64) -> Self {
+        let corner = 0.5 * (width as f64).hypot(height as f64);
+        let step = (corner_step / corner.max(1.0)).to_degrees();
+        let n = (max_deg / step).ceil().max(0.0) as i64;
+        let step = if n > 0 { max_deg / n as f64 } else { 0.0 };
+        Self { radius, angles_deg: (-n..=n).map(|i| i as f64 * step).collect() }
+    }
+
+    /// Angle between neighbours, degrees (0 for a single angle).
+    pub fn step_deg(&self) -> f64 {
+        if self.angles_deg.len() < 2 { 0.0 } else { self.angles_deg[1] - self.angles_deg[0] }
+    }
+}

@@ -1,0 +1,39 @@
+//! Camera response f and its inverse: irradiance B = f⁻¹(Z)/Δt (section II-A). No blur.
+
+/// Camera response f, per channel, normalised so that f(0) = 0 and f(1) = 1.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Response {
+    /// The sRGB curve.
+    Srgb,
+    /// Intensity is proportional to irradiance.
+    Linear,
+    /// Z = x^(1/γ).
+    Gamma(f64),
+    /// f⁻¹ sampled at equal steps of Z from 0 to 1, one non-decreasing table per channel, last value 1.
+    Table([Vec<f64>; 3]),
+}
+
+impl Response {
+    /// f⁻¹: relative exposure x = E Δt (1 is white) of intensity `z` in 0..=1.
+    pub fn inverse(&self, channel: usize, z: f64) -> f64 {
+        let z = z.clamp(0.0, 1.0);
+        match self {
+            Self::Srgb if z <= 0.04045 => z / 12.92,
+            Self::Srgb => ((z + 0.055) / 1.055).powf(2.4),
+            Self::Linear => z,
+            Self::Gamma(g) => z.powf(*g),
+            Self::Table(t) => {
+                let t = &t[channel];
+                let s = z * (t.len() - 1) as f64;
+                let i = (s as usize).min(t.len() - 2);
+                t[i] + (t[i + 1] - t[i]) * (s - i as f64)
+            }
+        }
+    }
+
+    /// Slope of f⁻¹ at `z` by central difference of width `step`.
+    pub fn inverse_slope(&self, channel: usize, z: f64, step: f64) -> f64 {
+        let (a, b) = ((z - step).max(0.0), (z + step).min(1.0));
+        (self.inverse(channel, b) - self.inverse(channel, a)) / (b - a)
+    }
+}

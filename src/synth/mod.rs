@@ -1,0 +1,1 @@
+//! Brackets with known truth.

@@ -1,0 +1,1 @@
+//! Irradiance to display.

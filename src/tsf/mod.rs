@@ -1,0 +1,127 @@
+//! Transformation spread functions (section II-B): which poses the camera went through and for how long.
+
+use crate::error::{Error, Result};
+use crate::pose::Pose;
+use serde::{Deserialize, Serialize};
+
+/// The TSF h_T of one frame: sparse poses whose weights sum to 1.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tsf {
+    /// Focal length in pixels of the frame that the poses speak of.
+    pub focal_px: f64,
+    /// The poses; weights positive, sum 1.
+    pub poses: Vec<Pose>,
+}
+
+impl Tsf {
+    /// Checks and normalises: poses of zero weight are dropped, the others' weights scaled to sum 1.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for no poses, negative or non-finite numbers, a sum of zero, a focal length that is not positive.
+    pub fn new(focal_px: f64, poses: Vec<Pose>) -> Result<Self> {
+        if !(focal_px.is_finite() && focal_px > 0.0) {
+            return Err(Error::Input(format!("focal length {focal_px} px is not a positive number")));
+        }
+        for p in &poses {
+            let all = [p.t_x, p.t_y, p.theta_x_deg, p.theta_y_deg, p.theta_z_deg, p.weight];
+            if all.iter().any(|v| !v.is_finite()) || p.weight < 0.0 {
+                return Err(Error::Input(format!("pose {p:?} holds a negative weight or a number that is not finite")));
+            }
+        }
+        let sum: f64 = poses.iter().map(|p| p.weight).sum();
+        if sum <= 0.0 {
+            return Err(Error::Input("a TSF needs at least one pose with a positive weight".into()));
+        }
+        let poses = poses.into_iter().filter(|p| p.weight > 0.0).map(|p| Pose { weight: p.weight / sum, ..p }).collect();
+        Ok(Self { focal_px, poses })
+    }
+
+    /// The TSF of a frame that is sharp and in place.
+    pub fn identity() -> Self {
+        Self { focal_px: 1000.0, poses: vec![Pose::IDENTITY] }
+    }
+
+    /// Whether the frame is the latent scene itself (single pose, nothing moves).
+    pub fn is_identity(&self) -> bool {
+        matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
+    }
+
+    /// Weighted mean pose: (t_x, t_y) in pixels, (θ_x, θ_y, θ_z) in degrees.
+    pub fn mean(&self) -> Pose {
+        let mut m = Pose { weight: 1.0, ..Pose::planar(0.0, 0.0, 0.0, 1.0) };
+        for p in &self.poses {
+            m.t_x += p.weight * p.t_x;
+            m.t_y += p.weight * p.t_y;
+            m.theta_x_deg += p.weight * p.theta_x_deg;
+            m.theta_y_deg += p.weight * p.theta_y_deg;
+            m.theta_z_deg += p.weight * p.theta_z_deg;
+        }
+        m
+    }
+}
+
+/// A frame's TSF as it stands in a TSF file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct TsfEntry {
+    /// File name of the frame (no folder).
+    pub frame: String,
+    /// Frame width in pixels.
+    pub width: usize,
+    /// Frame height in pixels.
+    pub height: usize,
+    /// Focal length in pixels.
+    pub focal_px: f64,
+    /// The poses.
+    pub poses: Vec<Pose>,
+}
+
+/// A TSF file: `{"format":"unshaken-tsf","version":1,"frames":[...]}`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct TsfFile {
+    /// Always `unshaken-tsf`.
+    pub format: String,
+    /// Always 1.
+    pub version: u32,
+    /// One entry per frame.
+    pub frames: Vec<TsfEntry>,
+}
+
+impl TsfFile {
+    /// `format` of every TSF file.
+    pub const FORMAT: &'static str = "unshaken-tsf";
+    /// The version that this program reads and writes.
+    pub const VERSION: u32 = 1;
+
+    /// A file that holds `frames`.
+    pub fn new(frames: Vec<TsfEntry>) -> Self {
+        Self { format: Self::FORMAT.into(), version: Self::VERSION, frames }
+    }
+
+    /// Reads the text of a TSF file.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for text that is not such a file.
+    pub fn parse(text: &str) -> Result<Self> {
+        let file: Self = serde_json::from_str(text)
+            .map_err(|e| Error::Input(format!("is not a TSF file ({e}); expected {{\"format\":\"unshaken-tsf\",\"version\":1,\"frames\":[...]}}")))?;
+        if file.format != Self::FORMAT || file.version != Self::VERSION {
+            return Err(Error::Input(format!(
+                "has format {:?} version {}; expected format \"unshaken-tsf\" version 1",
+                file.format, file.version
+            )));
+        }
+        Ok(file)
+    }
+
+    /// The TSF of the frame called `name`, checked against the frame's size; `None` when the file does not hold it.
+    ///
+    /// # Errors
+    /// [`Error::Input`] for a size other than the frame's and for what [`Tsf::new`] refuses.
+    pub fn find(&self, name: &str, width: usize, height: usize) -> Result<Option<Tsf>> {
+        let Some(e) = self.frames.iter().find(|e| e.frame == name) else { return Ok(None) };
+        if (e.width, e.height) != (width, height) {
+            return Err(Error::Input(format!("TSF of {name} is for {} x {} pixels, the frame is {width} x {height}", e.width, e.height)));
+        }
+        Tsf::new(e.focal_px, e.poses.clone()).map(Some).map_err(|x| Error::Input(format!("TSF of {name}: {x}")))
+    }
+}

@@ -1,0 +1,1 @@
+//! One test binary, so that wgpu is linked once.
