@@ -13,10 +13,13 @@
 //! 7. [`pipeline`]: these stages in order, from [`exposure::Bracket`] to irradiance and report.
 
 pub mod cli;
+pub mod deblur;
 pub mod error;
 pub mod exposure;
+pub mod gpu;
 pub mod image;
 pub mod io;
+pub mod kernels;
 pub mod metrics;
 pub mod pipeline;
 pub mod pose;

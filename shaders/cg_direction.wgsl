@@ -1,0 +1,21 @@
+// New search direction p = r / diagonal + beta p with beta = <r, z> / <r, z> of the step before, for one channel.
+struct Params {
+    count: u32,
+    row: u32,
+    _pad: vec2u,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> scalars: array<f32>;   // as in cg_scalars.wgsl
+@group(0) @binding(2) var<storage, read> residual: array<f32>;
+@group(0) @binding(3) var<storage, read> diagonal: array<f32>;
+@group(0) @binding(4) var<storage, read_write> direction: array<f32>;
+
+@compute @workgroup_size(128)
+fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
+    let i = (group.y * params.row + group.x) * 128u + local;
+    let beta = select(0.0, scalars[0] / scalars[2], scalars[2] > 0.0);
+    if i < params.count {
+        direction[i] = residual[i] / diagonal[i] + beta * direction[i];
+    }
+}

@@ -1,0 +1,24 @@
+// D^T w D x at pixel p for forward differences D that are zero across the border. No bindings, no entry points; the
+// including kernel declares `edge` (w) and the pointer-free accessor `value(i)` of x.
+fn smoothness(p: vec2i, size: vec2i) -> f32 {
+    let i = at(p, size.x);
+    let row = u32(size.x);
+    let here = value(i);
+    var sum = 0.0;
+    if p.x + 1 < size.x { sum += edge[i] * (here - value(i + 1u)); }
+    if p.y + 1 < size.y { sum += edge[i] * (here - value(i + row)); }
+    if p.x > 0 { sum += edge[i - 1u] * (here - value(i - 1u)); }
+    if p.y > 0 { sum += edge[i - row] * (here - value(i - row)); }
+    return sum;
+}
+
+// Diagonal of D^T w D.
+fn smoothness_diagonal(p: vec2i, size: vec2i) -> f32 {
+    let i = at(p, size.x);
+    var sum = 0.0;
+    if p.x + 1 < size.x { sum += edge[i]; }
+    if p.y + 1 < size.y { sum += edge[i]; }
+    if p.x > 0 { sum += edge[i - 1u]; }
+    if p.y > 0 { sum += edge[i - u32(size.x)]; }
+    return sum;
+}

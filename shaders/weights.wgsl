@@ -1,0 +1,57 @@
+// Data weights W and weighted observations W B of one channel of one frame, at the exposure that the present estimate
+// predicts. Eq. (8)'s mask, inverse variance of the irradiance (shot, read and quantisation noise), bias of noise clipped
+// at black, and the share that the frame loses where its residuals exceed what noise explains.
+struct Params {
+    size: vec2i,             // of the frame
+    predicted_offset: vec2i, // of frame pixel (0, 0) in the prediction
+    predicted_stride: i32,
+    out_offset: vec2i,       // of frame pixel (0, 0) in the outputs
+    out_stride: i32,
+    exposure_time: f32,      // s
+    robust: f32,             // strength of the residual-driven weights; 0: none
+    black_clipped: u32,
+    accumulate: u32,
+    // Standard deviation of the exposure (1 = white) at equal steps of sqrt(exposure) from 0 to 1.
+    noise: array<vec4f, 64>,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> predicted: array<f32>;  // K E, irradiance
+@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white
+@group(0) @binding(3) var<storage, read> mask: array<f32>;
+@group(0) @binding(4) var<storage, read> misfit: array<vec2f>;   // local sums of (chi^2, pixels)
+@group(0) @binding(5) var<storage, read_write> weight: array<f32>;
+@group(0) @binding(6) var<storage, read_write> observation: array<f32>;
+
+fn noise_of(exposure: f32) -> f32 {
+    let s = sqrt(clamp(exposure, 0.0, 1.0)) * 255.0;
+    let i = min(u32(s), 254u);
+    let a = params.noise[i / 4u][i % 4u];
+    let b = params.noise[(i + 1u) / 4u][(i + 1u) % 4u];
+    return mix(a, b, s - f32(i));
+}
+
+@compute @workgroup_size(16, 8)
+fn main(@builtin(global_invocation_id) id: vec3u) {
+    let p = vec2i(id.xy);
+    if any(p >= params.size) {
+        return;
+    }
+    let i = at(p, params.size.x);
+    let irradiance = max(predicted[at(p + params.predicted_offset, params.predicted_stride)], 0.0);
+    let expected = irradiance * params.exposure_time;
+    let s = noise_of(expected);
+    var m = Moments(expected, 1.0, s * s);
+    if params.black_clipped == 1u {
+        m = clipped_at_black(expected, s);
+    }
+    let local = misfit[i];
+    let excess = max(local.x / max(local.y, 1e-6) - 1.0, 0.0);
+    let gain = params.exposure_time * m.slope;
+    let w = mask[i] * mask[i] * gain * gain / (m.variance * (1.0 + params.robust * excess));
+    let b = w * (irradiance + (exposure[i] - m.mean) / gain);
+    let o = at(p + params.out_offset, params.out_stride);
+    let keep = params.accumulate == 1u;
+    weight[o] = select(0.0, weight[o], keep) + w;
+    observation[o] = select(0.0, observation[o], keep) + b;
+}

@@ -1,0 +1,566 @@
+//! Irradiance E from all frames and their TSFs: eq. (9)-(10) in log irradiance u, half-quadratic total variation, damped
+//! Gauss-Newton steps solved by preconditioned conjugate gradients on the GPU. No image leaves the GPU inside the loop.
+//!
+//! Each outer iteration computes the data weights W of every frame at the present estimate (mask² over the noise variance of
+//! the *predicted* exposure, less where a blurred frame's residuals exceed what noise explains), the edge weights
+//! w = λ/√(Σ_c|∇u_c|² + ε²), and solves
+//!
+//! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
+//!
+//! then tries u + s·clamp(δu, ±1) for s = 1, 1/2, 1/4, ... until the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with
+//! these weights) does not rise. λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
+//! The iteration stops when an outer step lowers the objective by less than `tolerance` of it, or at `outer` steps.
+
+use crate::error::Result;
+use crate::gpu::{self, Gpu, Step};
+use crate::image::{Plane, Rgb};
+use crate::kernels::{
+    Blur, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget, channels,
+    partials_1d, partials_2d,
+};
+use crate::tsf::{Interpolation, TapSet, Tsf};
+use serde::Serialize;
+
+/// One frame as the solver sees it.
+pub struct Observation {
+    /// Exposure f⁻¹(Z), 1 = white, three channels.
+    pub exposure: Rgb,
+    /// Mask of eq. (8), 0..=1, the same for all channels; 0 where any channel is clipped.
+    pub mask: Plane,
+    /// Exposure time in seconds.
+    pub exposure_time: f64,
+    /// Standard deviation of the exposure at equal steps of √exposure from 0 to 1, per channel
+    /// ([`crate::kernels::NOISE_STEPS`] values).
+    pub noise: [Vec<f32>; 3],
+    /// Whether the file's noise is clipped at black (every 8-bit file's is).
+    pub black_clipped: bool,
+    /// The frame's TSF.
+    pub tsf: Tsf,
+}
+
+/// What can be set about the solver.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Weight λ of total variation per unit of log irradiance, for three channels together.
+    pub lambda: f32,
+    /// Differences of log irradiance below ε are smoothed quadratically.
+    pub epsilon: f32,
+    /// Outer iterations (weights, Gauss-Newton) at most.
+    pub outer: usize,
+    /// Conjugate-gradient iterations of each outer one.
+    pub inner: usize,
+    /// Relative fall of the objective below which the iteration stops.
+    pub tolerance: f64,
+    /// Strength of the residual-driven weights of blurred frames; 0: none.
+    pub robust: f32,
+    /// Whether data weights follow the estimate; `false` freezes those of the start.
+    pub reweight: bool,
+    /// Interpolation of the warps.
+    pub interpolation: Interpolation,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            lambda: 5.0,
+            epsilon: 0.01,
+            outer: 6,
+            inner: 15,
+            tolerance: 1e-4,
+            robust: 2.0,
+            reweight: true,
+            interpolation: Interpolation::default(),
+        }
+    }
+}
+
+/// Why the solver stopped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum Stop {
+    /// The objective no longer fell.
+    Converged,
+    /// All outer iterations were used.
+    IterationLimit,
+    /// No step lowered the objective.
+    Breakdown,
+}
+
+/// One outer iteration.
+#[derive(Clone, Debug, Serialize)]
+pub struct Iteration {
+    /// Objective before the step, with the weights of this iteration.
+    pub before: f64,
+    /// Objective after it, with the same weights.
+    pub after: f64,
+    /// Damping s of the step; 0 when none lowered the objective.
+    pub step: f32,
+    /// ⟨r, z⟩ of the conjugate gradients at the end over that at the start.
+    pub reduction: f64,
+}
+
+/// How a solve went.
+#[derive(Clone, Debug, Serialize)]
+pub struct SolveReport {
+    /// Why it stopped.
+    pub stop: Stop,
+    /// The outer iterations.
+    pub history: Vec<Iteration>,
+    /// Mean squared residual over variance of each frame, where it is not masked: 1 is what noise explains.
+    pub chi_squared: Vec<f64>,
+}
+
+/// Irradiance and how it was reached.
+pub struct Solution {
+    /// Irradiance on the frame's grid plus the pad on every side.
+    pub irradiance: Rgb,
+    /// Pad in pixels.
+    pub pad: usize,
+    /// Local χ² of each frame (Gaussian of 2 px, frame's grid).
+    pub misfit: Vec<Plane>,
+    /// History and residuals.
+    pub report: SolveReport,
+}
+
+impl Solution {
+    /// Irradiance on the frame's grid alone.
+    pub fn cropped(&self) -> Rgb {
+        let (w, h) = self.irradiance.size();
+        self.irradiance.map_planes(|p| p.crop(self.pad, self.pad, w - 2 * self.pad, h - 2 * self.pad))
+    }
+}
+
+/// Pixels by which the latent grid must surround the frame so that no pose of `tsfs` looks beyond it, at most `limit`.
+pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usize {
+    let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let mut worst = 0.0f64;
+    for tsf in tsfs.iter().filter(|t| !t.is_identity()) {
+        for pose in &tsf.poses {
+            let inverse = pose.homography(tsf.focal_px).inverse();
+            for (i, j) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+                let p = crate::pose::project(&inverse, glam::DVec2::new(i * x, j * y));
+                worst = worst.max(p.x.abs() - x).max(p.y.abs() - y);
+            }
+        }
+    }
+    if worst == 0.0 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
+}
+
+struct Moving {
+    blur: Blur,
+    energy: f32,
+    weight: Channels,
+    observation: Channels,
+}
+
+struct Observed {
+    exposure: Channels,
+    mask: wgpu::Buffer,
+    misfit: wgpu::Buffer,
+    moving: Option<Moving>,
+}
+
+struct State {
+    irradiance: Channels,
+    log: Channels,
+    old: Channels,
+    solution: Channels,
+    residual: Channels,
+    direction: Channels,
+    product: Channels,
+    scaled: Channels,
+    back: Channels,
+    diagonal: Channels,
+    data_diagonal: Channels,
+    weight: Channels,
+    observation: Channels,
+    edge: wgpu::Buffer,
+    predicted: Channels,
+    frame: Channels,
+    misfit_scratch: wgpu::Buffer,
+    partials: wgpu::Buffer,
+    scalars: wgpu::Buffer,
+    scratch: Scratch,
+}
+
+/// Everything on the GPU for one bracket and one set of TSFs.
+struct Solver<'a> {
+    gpu: &'a Gpu,
+    kernels: &'a Kernels,
+    settings: &'a Settings,
+    observations: &'a [Observation],
+    observed: Vec<Observed>,
+    state: State,
+    frame: (usize, usize),
+    latent: (usize, usize),
+    pad: usize,
+}
+
+fn upload_rgb(gpu: &Gpu, label: &str, image: &Rgb) -> Result<Channels> {
+    let [r, g, b] = &image.0;
+    Ok([gpu.upload(label, &r.data)?, gpu.upload(label, &g.data)?, gpu.upload(label, &b.data)?])
+}
+
+/// Irradiance that explains `observations`, from the start `initial` (irradiance, positive; grid of the frame plus `pad` on
+/// every side). `progress` receives the fraction done; returning `false` cancels.
+///
+/// # Errors
+/// `Cancelled`; out of memory and lost device; NaN or infinity in the input.
+pub fn solve(
+    gpu: &Gpu,
+    kernels: &Kernels,
+    observations: &[Observation],
+    initial: &Rgb,
+    pad: usize,
+    settings: &Settings,
+    progress: &mut dyn FnMut(f32) -> bool,
+) -> Result<Solution> {
+    Solver::new(gpu, kernels, observations, initial, pad, settings)?.run(progress)
+}
+
+impl<'a> Solver<'a> {
+    fn new(
+        gpu: &'a Gpu,
+        kernels: &'a Kernels,
+        observations: &'a [Observation],
+        initial: &Rgb,
+        pad: usize,
+        settings: &'a Settings,
+    ) -> Result<Self> {
+        let latent = initial.size();
+        let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
+        let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
+        let blurs: Vec<Option<(Blur, f32)>> = observations
+            .iter()
+            .map(|o| {
+                (!o.tsf.is_identity()).then(|| {
+                    let taps = TapSet::new(&o.tsf, frame.0, frame.1, settings.interpolation);
+                    (Blur::new(gpu, &kernels.blur, &taps, frame, pad), taps.energy() as f32)
+                })
+            })
+            .collect();
+        let any_moving = blurs.iter().any(Option::is_some);
+        let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).max().unwrap_or(0);
+        let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).max().unwrap_or(0);
+        // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
+        let scratch = Scratch::new(gpu, wanted.min((1 << 25).max(needed)).min(gpu.max_plane()))?;
+        let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
+        let ch = |label, count| channels(gpu, label, count);
+        let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
+        let state = State {
+            irradiance: upload_rgb(gpu, "irradiance", &initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE))))?,
+            log: upload_rgb(gpu, "log irradiance", &log)?,
+            old: ch("log irradiance before the step", n)?,
+            solution: ch("step", n)?,
+            residual: ch("residual of the step", n)?,
+            direction: ch("search direction", n)?,
+            product: ch("product", n)?,
+            scaled: ch("scaled direction", n)?,
+            back: ch("back-projection", n)?,
+            diagonal: ch("preconditioner", n)?,
+            data_diagonal: ch("data diagonal", n)?,
+            weight: ch("weights of sharp frames", n)?,
+            observation: ch("observations of sharp frames", n)?,
+            edge: gpu.plane("edge weights", n)?,
+            predicted: ch("prediction", if any_moving { m } else { 1 })?,
+            frame: ch("frame", if any_moving { m } else { 1 })?,
+            misfit_scratch: gpu.plane("misfit", 2 * m)?,
+            partials: gpu.plane("partial sums", partials)?,
+            scalars: gpu.plane("scalars", 8)?,
+            scratch,
+        };
+        let mut observed = Vec::new();
+        for (o, blur) in observations.iter().zip(blurs) {
+            let moving = match blur {
+                None => None,
+                Some((blur, energy)) => Some(Moving { blur, energy, weight: ch("weights", m)?, observation: ch("observations", m)? }),
+            };
+            observed.push(Observed {
+                exposure: upload_rgb(gpu, "exposure", &o.exposure)?,
+                mask: gpu.upload("mask", &o.mask.data)?,
+                misfit: gpu.plane("misfit", 2 * m)?,
+                moving,
+            });
+        }
+        let mut solver = Self { gpu, kernels, settings, observations, observed, state, frame, latent, pad };
+        solver.mask_beyond()?;
+        Ok(solver)
+    }
+
+    /// Takes the pixels of blurred frames out of the masks that see beyond the latent grid: K of ones is less than 1 there.
+    fn mask_beyond(&mut self) -> Result<()> {
+        let (n, m) = (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1);
+        let one = self.gpu.upload("ones", &vec![1.0; n])?;
+        let ones: Channels = std::array::from_fn(|_| one.clone());
+        for (o, observed) in self.observations.iter().zip(&mut self.observed) {
+            if let Some(moving) = &observed.moving {
+                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &self.state.scratch, &ones, &self.state.predicted));
+                let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
+                let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
+                observed.mask = self.gpu.upload("mask", &mask)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn source<'b>(&'b self, i: usize) -> MisfitSource<'b> {
+        let (o, observed) = (&self.observations[i], &self.observed[i]);
+        let moving = observed.moving.is_some();
+        MisfitSource {
+            size: self.frame,
+            predicted: if moving { &self.state.predicted } else { &self.state.irradiance },
+            predicted_offset: if moving { 0 } else { self.pad },
+            predicted_stride: if moving { self.frame.0 } else { self.latent.0 },
+            exposure: &observed.exposure,
+            mask: &observed.mask,
+            exposure_time: o.exposure_time as f32,
+            black_clipped: o.black_clipped,
+            noise: &o.noise,
+        }
+    }
+
+    /// Weights and weighted observations of all frames at the present estimate.
+    fn weigh(&self) -> Vec<Step> {
+        let (s, data) = (&self.state, &self.kernels.data);
+        let mut steps = Vec::new();
+        let mut first = true;
+        for (i, observed) in self.observed.iter().enumerate() {
+            match &observed.moving {
+                None => {
+                    steps.push(Step::Clear(observed.misfit.clone()));
+                    let to = WeightTarget {
+                        weight: &s.weight,
+                        observation: &s.observation,
+                        offset: self.pad,
+                        stride: self.latent.0,
+                        accumulate: !first,
+                    };
+                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, 0.0, &to));
+                    first = false;
+                }
+                Some(moving) => {
+                    steps.extend(moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+                    steps.extend(data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch));
+                    let to = WeightTarget {
+                        weight: &moving.weight,
+                        observation: &moving.observation,
+                        offset: 0,
+                        stride: self.frame.0,
+                        accumulate: false,
+                    };
+                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, self.settings.robust, &to));
+                }
+            }
+        }
+        steps
+    }
+
+    /// Σ K^T W (B - K E) into `back`, the data term into its scalar.
+    fn residuals(&self, project_back: bool) -> Vec<Step> {
+        let (s, k) = (&self.state, self.kernels);
+        let (n, m) = (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1);
+        let mut steps = Vec::new();
+        let mut partial = 0;
+        for c in 0..3 {
+            steps.push(k.data.residual(self.gpu, &s.irradiance[c], &s.weight[c], &s.observation[c], &s.back[c], &s.partials, partial, n));
+            partial += partials_1d(n);
+        }
+        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
+            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.irradiance, &s.predicted));
+            for c in 0..3 {
+                let (w, o) = (&moving.weight[c], &moving.observation[c]);
+                steps.push(k.data.residual(self.gpu, &s.predicted[c], w, o, &s.frame[c], &s.partials, partial, m));
+                partial += partials_1d(m);
+            }
+            if project_back {
+                steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.frame, &s.back, 1.0));
+            }
+        }
+        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, partial, SLOT_DATA, false));
+        steps
+    }
+
+    fn edges(&self) -> Vec<Step> {
+        let (s, set) = (&self.state, self.settings);
+        let linear = &self.kernels.linear;
+        vec![
+            linear.edge_weight(self.gpu, &s.log, &s.edge, &s.partials, set.lambda, set.epsilon, self.latent),
+            linear.sum(self.gpu, &s.partials, &s.scalars, partials_2d(self.latent), SLOT_SMOOTHNESS, false),
+        ]
+    }
+
+    /// Right-hand side, preconditioner and the start of the conjugate gradients.
+    fn start(&self) -> Vec<Step> {
+        let (s, k) = (&self.state, self.kernels);
+        let n = self.latent.0 * self.latent.1;
+        let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
+        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
+            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &moving.weight, &s.data_diagonal, moving.energy));
+        }
+        for c in 0..3 {
+            steps.push(k.linear.right_side(
+                self.gpu,
+                &s.irradiance[c],
+                &s.back[c],
+                &s.edge,
+                &s.log[c],
+                &s.data_diagonal[c],
+                &s.residual[c],
+                &s.diagonal[c],
+                self.latent,
+            ));
+            let partial = c * partials_1d(n);
+            steps.push(k.linear.cg_start(
+                self.gpu,
+                &s.residual[c],
+                &s.diagonal[c],
+                &s.solution[c],
+                &s.direction[c],
+                &s.partials,
+                partial,
+                n,
+            ));
+        }
+        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_1d(n), SLOT_ENERGY, true));
+        steps
+    }
+
+    /// One iteration of the conjugate gradients.
+    fn iteration(&self) -> Vec<Step> {
+        let (s, k) = (&self.state, self.kernels);
+        let n = self.latent.0 * self.latent.1;
+        let mut steps = Vec::new();
+        for c in 0..3 {
+            steps.push(k.linear.scale(self.gpu, &s.irradiance[c], &s.direction[c], &s.weight[c], &s.scaled[c], &s.back[c], n));
+        }
+        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
+            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.scaled, &s.predicted));
+            for c in 0..3 {
+                steps.push(k.linear.multiply(self.gpu, &moving.weight[c], &s.predicted[c], self.frame.0 * self.frame.1));
+            }
+            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.predicted, &s.back, 1.0));
+        }
+        for c in 0..3 {
+            let partial = c * partials_2d(self.latent);
+            steps.push(k.linear.normal(
+                self.gpu,
+                &s.irradiance[c],
+                &s.back[c],
+                &s.edge,
+                &s.direction[c],
+                &s.product[c],
+                &s.partials,
+                partial,
+                self.latent,
+            ));
+        }
+        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_2d(self.latent), SLOT_CURVATURE, false));
+        for c in 0..3 {
+            steps.push(k.linear.cg_step(
+                self.gpu,
+                &s.scalars,
+                &s.direction[c],
+                &s.product[c],
+                &s.diagonal[c],
+                &s.solution[c],
+                &s.residual[c],
+                &s.partials,
+                c * partials_1d(n),
+                n,
+            ));
+        }
+        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_1d(n), SLOT_ENERGY, true));
+        for c in 0..3 {
+            steps.push(k.linear.cg_direction(self.gpu, &s.scalars, &s.residual[c], &s.diagonal[c], &s.direction[c], n));
+        }
+        steps
+    }
+
+    fn scalar(&self, slot: u32) -> Result<f64> {
+        Ok(f64::from(gpu::read(self.gpu, &self.state.scalars, 8)?[slot as usize]))
+    }
+
+    fn objective(&self) -> Result<f64> {
+        let s = gpu::read(self.gpu, &self.state.scalars, 8)?;
+        Ok(f64::from(s[SLOT_DATA as usize]) + f64::from(s[SLOT_SMOOTHNESS as usize]))
+    }
+
+    fn run(&self, progress: &mut dyn FnMut(f32) -> bool) -> Result<Solution> {
+        let (s, set) = (&self.state, self.settings);
+        let n = self.latent.0 * self.latent.1;
+        let (weigh, residuals, edges, start, iteration) =
+            (self.weigh(), self.residuals(true), self.edges(), self.start(), self.iteration());
+        let evaluate = [self.residuals(false), self.edges()].concat();
+        let update = |step: f32| -> Vec<Step> {
+            (0..3).map(|c| self.kernels.linear.update(self.gpu, &s.old[c], &s.solution[c], &s.log[c], &s.irradiance[c], step, n)).collect()
+        };
+        let keep: Vec<Step> = (0..3).map(|c| Step::Copy(s.log[c].clone(), s.old[c].clone())).collect();
+        let mut history = Vec::new();
+        let mut stop = Stop::IterationLimit;
+        for outer in 0..set.outer {
+            if outer == 0 || set.reweight {
+                self.gpu.submit(&weigh);
+            }
+            self.gpu.submit(&residuals);
+            self.gpu.submit(&edges);
+            self.gpu.submit(&start);
+            let before = self.objective()?;
+            let energy = self.scalar(SLOT_ENERGY)?;
+            for i in 0..set.inner {
+                self.gpu.submit(&iteration);
+                // Waiting now and then keeps the queue short and the progress honest.
+                if i % 5 == 4 {
+                    self.scalar(SLOT_ENERGY)?;
+                    if !progress((outer as f32 + i as f32 / set.inner as f32) / set.outer as f32) {
+                        return Err(crate::error::Error::Cancelled);
+                    }
+                }
+            }
+            let reduction = self.scalar(SLOT_ENERGY)? / energy.max(f64::MIN_POSITIVE);
+            self.gpu.submit(&keep);
+            let mut step = 1.0f32;
+            let mut after;
+            loop {
+                self.gpu.submit(&update(step));
+                self.gpu.submit(&evaluate);
+                after = self.objective()?;
+                if after <= before || step == 0.0 {
+                    break;
+                }
+                step = if step > 0.02 { step * 0.5 } else { 0.0 };
+            }
+            history.push(Iteration { before, after, step, reduction });
+            if step == 0.0 {
+                stop = Stop::Breakdown;
+                break;
+            }
+            if before - after < set.tolerance * before.abs() {
+                stop = Stop::Converged;
+                break;
+            }
+        }
+        self.finish(history, stop)
+    }
+
+    fn finish(&self, history: Vec<Iteration>, stop: Stop) -> Result<Solution> {
+        let (s, m) = (&self.state, self.frame.0 * self.frame.1);
+        let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
+        for (i, observed) in self.observed.iter().enumerate() {
+            if let Some(moving) = &observed.moving {
+                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+            }
+            let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);
+            self.gpu.submit(&steps[..1]);
+            let pairs = gpu::read(self.gpu, &observed.misfit, 2 * m)?;
+            let (chi, count) = pairs.chunks_exact(2).fold((0.0, 0.0), |(a, b), p| (a + f64::from(p[0]), b + f64::from(p[1])));
+            chi_squared.push(if count > 0.0 { chi / count } else { f64::NAN });
+            self.gpu.submit(&steps[1..]);
+            let pairs = gpu::read(self.gpu, &observed.misfit, 2 * m)?;
+            let local = pairs.chunks_exact(2).map(|p| if p[1] > 1e-3 { p[0] / p[1] } else { 0.0 }).collect();
+            misfit.push(Plane::from_vec(self.frame.0, self.frame.1, local)?);
+        }
+        let n = self.latent.0 * self.latent.1;
+        let plane = |c: usize| Plane::from_vec(self.latent.0, self.latent.1, gpu::read(self.gpu, &s.irradiance[c], n)?);
+        let irradiance = Rgb([plane(0)?, plane(1)?, plane(2)?]);
+        Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared } })
+    }
+}

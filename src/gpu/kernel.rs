@@ -1,0 +1,105 @@
+//! A compute pipeline and its dispatches.
+
+use super::Gpu;
+
+/// One compiled kernel: binding 0 is its uniform `Params`, storage buffers follow in order.
+pub struct Kernel {
+    label: &'static str,
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+}
+
+/// One recorded piece of work: made once, submitted as often as needed.
+#[derive(Clone)]
+pub enum Step {
+    /// A kernel's dispatch.
+    Dispatch {
+        /// The kernel.
+        pipeline: wgpu::ComputePipeline,
+        /// Its parameters and buffers.
+        bindings: wgpu::BindGroup,
+        /// Workgroups.
+        groups: [u32; 3],
+    },
+    /// A buffer's content copied to another of the same size.
+    Copy(wgpu::Buffer, wgpu::Buffer),
+    /// A buffer filled with zeros.
+    Clear(wgpu::Buffer),
+}
+
+/// Workgroups for `count` invocations of kernels with 128 lanes, as (per row, rows): one dimension holds 65 535 at most.
+pub fn grid_1d(count: usize) -> (u32, u32) {
+    let groups = count.div_ceil(128).max(1) as u32;
+    let row = groups.min(32768);
+    (row, groups.div_ceil(row))
+}
+
+impl Kernel {
+    /// Compiles `source`, whose entry point is `main`, with values for its `override` constants.
+    pub fn new(gpu: &Gpu, label: &'static str, source: &str, constants: &[(&str, f64)]) -> Self {
+        let module = gpu
+            .device
+            .create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) });
+        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: None,
+            module: &module,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions { constants, ..Default::default() },
+            cache: None,
+        });
+        let layout = pipeline.get_bind_group_layout(0);
+        Self { label, pipeline, layout }
+    }
+
+    /// A dispatch of `groups` workgroups with these parameters and buffers.
+    pub fn step<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], groups: [u32; 3]) -> Step {
+        let bytes = bytemuck::bytes_of(params);
+        let uniform = gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(self.label),
+            size: bytes.len() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        gpu.queue.write_buffer(&uniform, 0, bytes);
+        let entries: Vec<_> = std::iter::once(&uniform)
+            .chain(buffers.iter().copied())
+            .enumerate()
+            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: b.as_entire_binding() })
+            .collect();
+        let bindings =
+            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries });
+        Step::Dispatch { pipeline: self.pipeline.clone(), bindings, groups }
+    }
+
+    /// [`Kernel::step`] over an image of `size` with workgroups of 16 x 8, `depth` deep.
+    pub fn step_2d<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], size: (usize, usize), depth: usize) -> Step {
+        self.step(gpu, params, buffers, [size.0.div_ceil(16) as u32, size.1.div_ceil(8) as u32, depth as u32])
+    }
+
+    /// [`Kernel::step`] over `count` values with workgroups of 128.
+    pub fn step_1d<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], count: usize) -> Step {
+        let (row, rows) = grid_1d(count);
+        self.step(gpu, params, buffers, [row, rows, 1])
+    }
+}
+
+/// Records `steps` in order; dispatches that follow one another share a compute pass.
+pub(super) fn record(steps: &[Step], encoder: &mut wgpu::CommandEncoder) {
+    for run in steps.chunk_by(|a, b| matches!((a, b), (Step::Dispatch { .. }, Step::Dispatch { .. }))) {
+        match &run[0] {
+            Step::Copy(from, to) => encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size()),
+            Step::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
+            Step::Dispatch { .. } => {
+                let mut pass = encoder.begin_compute_pass(&Default::default());
+                for step in run {
+                    if let Step::Dispatch { pipeline, bindings, groups } = step {
+                        pass.set_pipeline(pipeline);
+                        pass.set_bind_group(0, bindings, &[]);
+                        pass.dispatch_workgroups(groups[0], groups[1], groups[2]);
+                    }
+                }
+            }
+        }
+    }
+}

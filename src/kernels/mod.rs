@@ -1,0 +1,66 @@
+//! The solver's operators on the GPU, one file per group of shaders. Knows no algorithm.
+
+mod blur;
+mod data;
+mod linear;
+
+pub use blur::{Blur, BlurKernels, Scratch};
+pub use data::{DataKernels, MisfitSource, NOISE_STEPS, WeightTarget};
+pub use linear::{LinearKernels, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, partials_1d, partials_2d};
+
+use crate::gpu::Gpu;
+use crate::tsf::Interpolation;
+
+/// Three buffers of one size: red, green, blue.
+pub type Channels = [wgpu::Buffer; 3];
+
+/// Three planes of `count` zeros.
+///
+/// # Errors
+/// As [`Gpu::plane`].
+pub fn channels(gpu: &Gpu, label: &str, count: usize) -> crate::error::Result<Channels> {
+    Ok([gpu.plane(label, count)?, gpu.plane(label, count)?, gpu.plane(label, count)?])
+}
+
+/// All kernels, compiled once per device.
+pub struct Kernels {
+    /// K and Kᵀ.
+    pub blur: BlurKernels,
+    /// Data weights and residuals.
+    pub data: DataKernels,
+    /// Smoothness and conjugate gradients.
+    pub linear: LinearKernels,
+}
+
+impl Kernels {
+    /// Compiles everything; warps use `interpolation`.
+    pub fn new(gpu: &Gpu, interpolation: Interpolation) -> Self {
+        Self { blur: BlurKernels::new(gpu, interpolation), data: DataKernels::new(gpu), linear: LinearKernels::new(gpu) }
+    }
+}
+
+/// Every shader of the program as (name, whole source), for validation without a GPU.
+pub const SHADERS: &[(&str, &str)] = &[
+    ("warp", blur::WARP),
+    ("warp_adjoint", blur::WARP_ADJOINT),
+    ("tap_sum", blur::TAP_SUM),
+    ("weights", data::WEIGHTS),
+    ("misfit", data::MISFIT),
+    ("gauss", data::GAUSS),
+    ("residual", data::RESIDUAL),
+    ("edge_weight", linear::EDGE_WEIGHT),
+    ("normal", linear::NORMAL),
+    ("right_side", linear::RIGHT_SIDE),
+    ("scale", linear::SCALE),
+    ("multiply", linear::MULTIPLY),
+    ("cg_start", linear::CG_START),
+    ("cg_step", linear::CG_STEP),
+    ("cg_direction", linear::CG_DIRECTION),
+    ("cg_scalars", linear::CG_SCALARS),
+    ("update", linear::UPDATE),
+];
+
+/// Sizes of the Rust mirrors of the shaders' `Params` as (shader, bytes), to be compared with what naga lays out.
+pub fn params_sizes() -> Vec<(&'static str, usize)> {
+    [blur::params_sizes(), data::params_sizes(), linear::params_sizes()].concat()
+}
