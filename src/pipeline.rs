@@ -1,10 +1,21 @@
 //! The stages in order: a bracket in, irradiance and report out. No mathematics, no files, no printing.
 
-use crate::error::Result;
+use crate::deblur::{self, Observation, Solution};
+use crate::error::{Error, Result};
 use crate::exposure::Bracket;
-use crate::image::Rgb;
+use crate::gpu::Gpu;
+use crate::image::{Plane, Rgb};
+use crate::kernels::Kernels;
+use crate::mask;
+use crate::merge;
+use crate::noise::{self, NoiseModel};
+use crate::pose::PoseGrid;
+use crate::psf;
 use crate::response::Response;
-use crate::tsf::TsfFile;
+use crate::triage::{self, Verdict};
+use crate::tsf::{self, Tsf, TsfEntry, TsfFile, WholeFrame};
+use serde_json::{Value, json};
+use std::time::Instant;
 
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
 #[derive(Clone, Debug)]
@@ -17,11 +28,13 @@ pub struct Settings {
     pub exclude: Vec<usize>,
     /// α of the Tukey window, 0..=1.
     pub alpha: f64,
+    /// The solver's settings.
+    pub deblur: deblur::Settings,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { reference: None, sharp: None, exclude: Vec::new(), alpha: 0.3 }
+        Self { reference: None, sharp: None, exclude: Vec::new(), alpha: 0.3, deblur: deblur::Settings::default() }
     }
 }
 
@@ -46,14 +59,40 @@ pub struct Outcome {
     /// Index (0-based, in command-line order) of the reference frame.
     pub reference: usize,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
-    pub report: serde_json::Value,
+    pub report: Value,
+}
+
+/// Most pixels by which the latent grid surrounds the frame, as a part of the frame's longer side.
+const LARGEST_PAD: f64 = 0.15;
+/// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
+const ROUNDS: usize = 2;
+/// Local PSFs per blurred frame.
+const PATCHES: usize = 9;
+/// Side of a patch in pixels.
+const PATCH_SIZE: usize = 96;
+/// Largest translation of the pose grid, pixels.
+const GRID_RADIUS: usize = 16;
+/// Largest roll of the pose grid, degrees.
+const GRID_DEGREES: f64 = 2.0;
+
+struct Run<'a> {
+    gpu: Gpu,
+    kernels: Kernels,
+    bracket: &'a Bracket,
+    settings: &'a Settings,
+    exposures: Vec<Rgb>,
+    masks: Vec<Plane>,
+    noise: NoiseModel,
+    curves: Vec<[Vec<f32>; 3]>,
+    events: &'a mut dyn FnMut(Event) -> bool,
+    timings: Vec<(String, f64)>,
 }
 
 /// Reconstructs the irradiance of `bracket`. `given`: TSFs to use instead of estimating them. `events` is called from
 /// the calling thread; returning `false` cancels.
 ///
 /// # Errors
-/// [`crate::error::Error::Input`] for settings or TSFs that do not fit the bracket, `Cancelled`, and the GPU's errors.
+/// [`Error::Input`] for settings or TSFs that do not fit the bracket, `Cancelled`, and the GPU's errors.
 pub fn merge(
     bracket: &Bracket,
     response: &Response,
@@ -61,6 +100,264 @@ pub fn merge(
     given: Option<&TsfFile>,
     events: &mut dyn FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let _ = (bracket, response, settings, given, events);
-    Err(crate::error::Error::Cancelled)
+    let frames = bracket.frames();
+    let excluded = check(bracket, settings)?;
+    let gpu = Gpu::new()?;
+    let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
+    let start = Instant::now();
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
+    let noise = noise::estimate(frames, &exposures, response);
+    let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
+    let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref());
+    let mut run = Run { gpu, kernels, bracket, settings, exposures, masks: Vec::new(), noise, curves, events, timings: Vec::new() };
+    run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
+    run.reconstruct(verdicts, &excluded, given)
 }
+
+fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
+    let n = bracket.frames().len();
+    let listed = settings.exclude.iter().chain(settings.sharp.iter().flatten()).chain(settings.reference.iter());
+    for &i in listed {
+        if i >= n {
+            return Err(Error::Input(format!("frame {} does not exist: the bracket has {n} frames, counted from 1", i + 1)));
+        }
+    }
+    let excluded: Vec<bool> = (0..n).map(|i| settings.exclude.contains(&i)).collect();
+    if excluded.iter().all(|e| *e) {
+        return Err(Error::Input("every frame is excluded; leave at least one".into()));
+    }
+    if let Some(r) = settings.reference
+        && excluded[r]
+    {
+        return Err(Error::Input(format!("{}: is the reference frame and excluded; choose another reference", bracket.frames()[r].name)));
+    }
+    Ok(excluded)
+}
+
+impl Run<'_> {
+    fn progress(&mut self, stage: &str, fraction: f32) -> Result<()> {
+        if (self.events)(Event::Progress { stage: stage.into(), fraction }) { Ok(()) } else { Err(Error::Cancelled) }
+    }
+
+    fn warn(&mut self, text: String) -> Result<()> {
+        if (self.events)(Event::Warning(text)) { Ok(()) } else { Err(Error::Cancelled) }
+    }
+
+    fn timed<T>(&mut self, what: &str, f: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
+        let start = Instant::now();
+        let out = f(self)?;
+        self.timings.push((what.into(), start.elapsed().as_secs_f64()));
+        Ok(out)
+    }
+
+    fn reconstruct(mut self, verdicts: Vec<Verdict>, excluded: &[bool], given: Option<&TsfFile>) -> Result<Outcome> {
+        let frames = self.bracket.frames();
+        let (w, h) = self.bracket.size();
+        let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
+        let mut tsfs: Vec<Option<Tsf>> = vec![None; frames.len()];
+        if let Some(file) = given {
+            for &i in &used {
+                tsfs[i] = file.find(&frames[i].name, w, h)?;
+                if tsfs[i].is_none() {
+                    self.warn(format!("{}: the TSF file does not hold it; its TSF is estimated", frames[i].name))?;
+                }
+            }
+        }
+        let mut sharp: Vec<bool> =
+            (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, Tsf::is_identity)).collect();
+        let all_known = used.iter().all(|&i| tsfs[i].is_some());
+        let blind = !sharp.contains(&true) && !all_known;
+        if blind {
+            self.warn("no frame is sharp: the frames are merged without deblurring".into())?;
+            for &i in &used {
+                sharp[i] = true;
+                tsfs[i] = Some(Tsf::identity());
+            }
+        }
+        let reference = self.settings.reference.unwrap_or_else(|| {
+            let longest = |ids: Vec<usize>| ids.into_iter().max_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time));
+            let sharps = used.iter().copied().filter(|&i| sharp[i]).collect();
+            longest(sharps)
+                .or_else(|| used.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)))
+                .unwrap_or(0)
+        });
+        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32);
+        let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
+        let mut details: Vec<Value> = vec![Value::Null; frames.len()];
+
+        // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
+        let start_frames = if still.is_empty() { shaken.clone() } else { still.clone() };
+        self.progress("merging the sharp frames", 0.03)?;
+        let initial = merge::irradiance(self.bracket, &self.exposures, &self.masks, &self.curves, &start_frames);
+        for &i in &still {
+            tsfs[i] = Some(Tsf::identity());
+        }
+        let base = self
+            .timed("sharp frames", |run| run.solve(&start_frames, &vec![Some(Tsf::identity()); frames.len()], &initial, 0, 0.05, 0.10))?;
+        let mut latent = base.cropped();
+        let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
+        for (k, &i) in estimated.iter().enumerate() {
+            self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
+            let (tsf, detail) = self.timed("blur", |run| Ok(run.estimate(i, &latent)))?;
+            if tsf.is_none() {
+                self.warn(format!(
+                    "{}: no blur explains it against the sharp frames (too little structure that both see); it is left out",
+                    frames[i].name
+                ))?;
+            }
+            tsfs[i] = tsf;
+            details[i] = detail;
+        }
+        let shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
+        let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
+        let mut solution = base;
+        if !shaken.is_empty() {
+            let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
+            for round in 0..rounds {
+                let at = |part: f32| 0.40 + 0.58 * (round as f32 + part) / rounds as f32;
+                if round > 0 {
+                    self.progress("refining the blur", at(0.0))?;
+                    latent = solution.cropped();
+                    for &i in estimated.iter().filter(|i| shaken.contains(i)) {
+                        tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
+                    }
+                }
+                let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
+                let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
+                let from = latent.map_planes(|p| p.padded(pad));
+                solution = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, at(0.3), at(1.0)))?;
+            }
+        }
+        self.progress("finishing", 0.99)?;
+        self.finish(solution, reference, &verdicts, &sharp, &all, &tsfs, details)
+    }
+
+    /// Solves for the frames `ids`; progress runs from `from` to `to`.
+    fn solve(&mut self, ids: &[usize], tsfs: &[Option<Tsf>], initial: &Rgb, pad: usize, from: f32, to: f32) -> Result<Solution> {
+        let frames = self.bracket.frames();
+        let observations: Vec<Observation> = ids
+            .iter()
+            .map(|&i| Observation {
+                exposure: self.exposures[i].clone(),
+                mask: self.masks[i].clone(),
+                exposure_time: frames[i].exposure_time,
+                noise: self.curves[i].clone(),
+                black_clipped: true,
+                tsf: tsfs[i].clone().unwrap_or_else(Tsf::identity),
+            })
+            .collect();
+        let padded = if pad > 0 && initial.size() == self.bracket.size() { initial.map_planes(|p| p.padded(pad)) } else { initial.clone() };
+        let events = &mut self.events;
+        let stage = if ids.iter().any(|&i| !observations[ids.iter().position(|&k| k == i).unwrap_or(0)].tsf.is_identity()) {
+            "deblurring"
+        } else {
+            "merging the sharp frames"
+        };
+        deblur::solve(&self.gpu, &self.kernels, &observations, &padded, pad, &self.settings.deblur, &mut |f| {
+            events(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f })
+        })
+    }
+
+    /// Luminance of frame `i` and its inverse variance, model error included.
+    fn luminance(&self, i: usize, latent: &Plane) -> (Plane, Plane) {
+        let frame = &self.bracket.frames()[i];
+        let dt = frame.exposure_time as f32;
+        let exposure = self.exposures[i].mean();
+        let local = merge::gradient_level(latent, 4);
+        let weight = Plane {
+            data: (0..exposure.data.len())
+                .map(|p| {
+                    let m = self.masks[i].data[p];
+                    // An operator is never true to better than a few per cent of the structure around a pixel.
+                    let variance =
+                        self.noise.variance(f64::from(exposure.data[p])) as f32 / 3.0 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
+                    m * m / variance
+                })
+                .collect(),
+            ..exposure
+        };
+        (exposure.map(|v| v / dt), weight)
+    }
+
+    /// TSF of frame `i` against the sharp irradiance: patches, PSFs (11), TSF from the PSFs (6), whole frame.
+    fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
+        let latent = latent.mean();
+        let (w, h) = latent.size();
+        let (blurred, weight) = self.luminance(i, &latent);
+        let patches = psf::choose(&latent, &weight, PATCH_SIZE.min(w / 2).min(h / 2).max(16), PATCHES);
+        let psfs: Vec<(psf::Patch, psf::Psf)> =
+            patches.iter().filter_map(|p| Some((*p, psf::estimate(&latent, 0, &blurred, &weight, p, GRID_RADIUS)?))).collect();
+        let grid = PoseGrid::new(w, h, GRID_RADIUS, GRID_DEGREES, 1.0);
+        let from_psfs = tsf::from_psfs(&psfs, &grid, w, h);
+        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
+        let tsf = frame.fit_grid(&grid, from_psfs.as_ref()).map(|t| frame.refine(&t, self.settings.deblur.interpolation));
+        let detail = json!({
+            "patches": psfs.iter().map(|(p, h)| json!({
+                "x": p.x, "y": p.y, "size": p.size, "score": p.score,
+                "psf": { "radius": h.radius, "extent_px": h.extent(), "values": h.values.data },
+            })).collect::<Vec<_>>(),
+            "tsf_from_psfs": from_psfs.map(|t| t.poses),
+        });
+        (tsf, detail)
+    }
+
+    fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
+        let latent = latent.mean();
+        let (blurred, weight) = self.luminance(i, &latent);
+        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
+        tsf.map(|t| frame.refine(t, self.settings.deblur.interpolation))
+    }
+
+    fn finish(
+        mut self,
+        solution: Solution,
+        reference: usize,
+        verdicts: &[Verdict],
+        sharp: &[bool],
+        all: &[usize],
+        tsfs: &[Option<Tsf>],
+        details: Vec<Value>,
+    ) -> Result<Outcome> {
+        let frames = self.bracket.frames();
+        let (w, h) = self.bracket.size();
+        let mut irradiance = solution.cropped();
+        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, all);
+        let scale = frames[reference].exposure_time as f32;
+        let irradiance = irradiance.map_planes(|p| p.map(|v| v * scale));
+        let entries: Vec<Value> = (0..frames.len())
+            .map(|i| {
+                let position = all.iter().position(|&k| k == i);
+                json!({
+                    "frame": frames[i].name,
+                    "exposure_time_s": frames[i].exposure_time,
+                    "used": position.is_some(),
+                    "sharp": sharp[i],
+                    "triage": verdicts[i],
+                    "chi_squared": position.map(|p| solution.report.chi_squared[p]),
+                    "blur": details[i],
+                    "tsf": tsfs[i].as_ref().map(|t| TsfEntry {
+                        frame: frames[i].name.clone(), width: w, height: h, focal_px: t.focal_px, poses: t.poses.clone(),
+                    }),
+                })
+            })
+            .collect();
+        let report = json!({
+            "format": "unshaken-report",
+            "version": 1,
+            "program": concat!("unshaken ", env!("CARGO_PKG_VERSION")),
+            "adapter": self.gpu.description,
+            "size": [w, h],
+            "reference": frames[reference].name,
+            "scale": { "rule": "value = irradiance * exposure time of the reference frame", "factor_s": scale },
+            "noise": self.noise,
+            "frames": entries,
+            "solver": solution.report,
+            "timings_s": std::mem::take(&mut self.timings),
+        });
+        Ok(Outcome { irradiance, reference, report })
+    }
+}
+
+/// Standard deviation of the operator's own error, as a part of the mean absolute gradient around a pixel.
+const MODEL_ERROR: f32 = 0.05;

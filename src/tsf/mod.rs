@@ -1,8 +1,13 @@
 //! Transformation spread functions (section II-B): which poses the camera went through and for how long.
 
+mod active_set;
+mod from_psfs;
 mod taps;
+mod whole_frame;
 
+pub use from_psfs::from_psfs;
 pub use taps::{Interpolation, Tap, TapSet};
+pub use whole_frame::WholeFrame;
 
 use crate::error::{Error, Result};
 use crate::pose::Pose;

@@ -1,0 +1,59 @@
+//! Masks m of eq. (8): Tukey windows of the intensity, and what is clipped. No irradiance.
+
+use crate::exposure::Frame;
+use crate::image::Plane;
+
+/// Intensity from which a channel counts as clipped: the well clips after the noise, so that values just below white are
+/// already biased. 250 of 255.
+pub const CLIPPED: f32 = 250.0 / 255.0;
+
+/// Tukey window at `z` in 0..=1: 1 in the middle, cosine tapers of width α/2 at both ends.
+pub fn tukey(z: f32, alpha: f32) -> f32 {
+    low_taper(z, alpha) * low_taper(1.0 - z, alpha)
+}
+
+fn low_taper(z: f32, alpha: f32) -> f32 {
+    let z = z.clamp(0.0, 1.0);
+    if alpha <= 0.0 || z >= 0.5 * alpha { 1.0 } else { 0.5 * (1.0 - (2.0 * std::f32::consts::PI * z / alpha).cos()) }
+}
+
+/// Grey equivalent of a frame's intensity (Rec. 601 luma).
+pub fn grey(frame: &Frame) -> Plane {
+    let [r, g, b] = &frame.intensity.0;
+    Plane::from_fn(r.width, r.height, |x, y| 0.299 * r.at(x, y) + 0.587 * g.at(x, y) + 0.114 * b.at(x, y))
+}
+
+/// Where any channel of the frame is clipped.
+pub fn clipped(frame: &Frame) -> Vec<bool> {
+    let [r, g, b] = &frame.intensity.0;
+    (0..r.data.len()).map(|i| r.data[i] >= CLIPPED || g.data[i] >= CLIPPED || b.data[i] >= CLIPPED).collect()
+}
+
+/// One mask per frame, 0..=1, the same for all channels.
+///
+/// The window's high end applies everywhere, and the mask is 0 wherever any channel is clipped. Its low end applies only where
+/// a longer frame that is at least as sharp has the pixel in the flat part of its own window: elsewhere the dark values are
+/// the best there is, and their variance already says what they are worth (the low end alone costs 3 dB).
+pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32) -> Vec<Plane> {
+    let greys: Vec<Plane> = frames.iter().map(grey).collect();
+    let clipped: Vec<Vec<bool>> = frames.iter().map(clipped).collect();
+    frames
+        .iter()
+        .enumerate()
+        .map(|(i, f)| {
+            let better: Vec<usize> =
+                (0..frames.len()).filter(|&j| frames[j].exposure_time > 1.001 * f.exposure_time && (sharp[j] || !sharp[i])).collect();
+            let data = (0..greys[i].data.len())
+                .map(|p| {
+                    if clipped[i][p] {
+                        return 0.0;
+                    }
+                    let z = greys[i].data[p];
+                    let covered = better.iter().any(|&j| !clipped[j][p] && tukey(greys[j].data[p], alpha) >= 1.0);
+                    low_taper(1.0 - z, alpha) * if covered { low_taper(z, alpha) } else { 1.0 }
+                })
+                .collect();
+            Plane { width: greys[i].width, height: greys[i].height, data }
+        })
+        .collect()
+}

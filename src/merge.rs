@@ -1,0 +1,67 @@
+//! Irradiance of sharp frames by weighted mean: the start of everything else.
+
+use crate::exposure::Bracket;
+use crate::image::{Plane, Rgb};
+use crate::kernels::NOISE_STEPS;
+use crate::mask;
+
+/// Inverse-variance mean of f⁻¹(Z)/Δt over the frames `ids`, positive everywhere. Variances are those of the locally smoothed exposure: a
+/// pixel's own value would give more weight to what noise made darker.
+pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves: &[[Vec<f32>; 3]], ids: &[usize]) -> Rgb {
+    let (w, h) = bracket.size();
+    let frames = bracket.frames();
+    let shortest = ids.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)).unwrap_or(0);
+    let longest = ids.iter().map(|&i| frames[i].exposure_time).fold(0.0, f64::max) as f32;
+    Rgb(std::array::from_fn(|c| {
+        let smooth: Vec<Plane> = ids.iter().map(|&i| box_mean(&exposures[i].0[c], 2)).collect();
+        // A tenth of the longest frame's noise at black: below it nothing is known, and log irradiance needs a floor.
+        let floor = 0.1 * ids.iter().map(|&i| curves[i][c][0]).fold(f32::INFINITY, f32::min) / longest;
+        Plane::from_fn(w, h, |x, y| {
+            let p = y * w + x;
+            let (mut num, mut den) = (0.0f64, 0.0f64);
+            for (s, &i) in smooth.iter().zip(ids) {
+                let dt = frames[i].exposure_time as f32;
+                let k = ((s.data[p].clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1);
+                let m = masks[i].data[p];
+                let weight = f64::from(m * m * dt * dt / (curves[i][c][k] * curves[i][c][k]));
+                num += weight * f64::from(exposures[i].0[c].data[p] / dt);
+                den += weight;
+            }
+            let value =
+                if den > 0.0 { (num / den) as f32 } else { exposures[shortest].0[c].data[p] / frames[shortest].exposure_time as f32 };
+            value.max(floor)
+        })
+    }))
+}
+
+/// Raises pixels that the shortest of the frames `ids` has clipped to the irradiance that clips it: the best lower bound there is.
+pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: &[Rgb], ids: &[usize]) {
+    let frames = bracket.frames();
+    let Some(shortest) = ids.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)) else { return };
+    for c in 0..3 {
+        let z = &frames[shortest].intensity.0[c];
+        for (p, v) in irradiance.0[c].data.iter_mut().enumerate() {
+            if z.data[p] >= mask::CLIPPED {
+                *v = v.max(exposures[shortest].0[c].data[p] / frames[shortest].exposure_time as f32);
+            }
+        }
+    }
+}
+
+/// Mean over squares of side 2 r + 1, edge pixels repeated.
+fn box_mean(plane: &Plane, r: isize) -> Plane {
+    let n = (2 * r + 1) as f32;
+    let (w, h) = plane.size();
+    let rows = Plane::from_fn(w, h, |x, y| (-r..=r).map(|k| plane.clamped(x as isize + k, y as isize)).sum::<f32>() / n);
+    Plane::from_fn(w, h, |x, y| (-r..=r).map(|k| rows.clamped(x as isize, y as isize + k)).sum::<f32>() / n)
+}
+
+/// Mean absolute gradient of `plane` around each pixel, over squares of side 2 r + 1.
+pub fn gradient_level(plane: &Plane, r: isize) -> Plane {
+    let (w, h) = plane.size();
+    let gradient = Plane::from_fn(w, h, |x, y| {
+        let (i, j) = (x as isize, y as isize);
+        (plane.clamped(i + 1, j) - plane.clamped(i, j)).hypot(plane.clamped(i, j + 1) - plane.clamped(i, j))
+    });
+    box_mean(&gradient, r)
+}
