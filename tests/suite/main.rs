@@ -1,4 +1,8 @@
 //! One test binary, so that wgpu is linked once.
 
+/// Quality measures against stored values of an independent implementation.
+mod metrics;
 /// Synthetic brackets against the physics that they claim.
 mod synth;
+/// Tone mapping: degenerate images, shadows and highlights together, no halos.
+mod tonemap;
