@@ -9,9 +9,9 @@ use crate::image::{Plane, Rgb};
 use rayon::prelude::*;
 
 /// Luminance of the middle of the picture, white being 1.
-const KEY: f32 = 0.17;
+const KEY: f32 = 0.18;
 /// Decades that large areas may span after compression.
-const DECADES: f32 = 1.7;
+const DECADES: f32 = 2.1;
 /// Width of the bilateral filter in decades: what differs by more is another area.
 const RANGE: f32 = 0.35;
 

@@ -73,7 +73,7 @@ pub fn run(output_dir: &Path, progress: &mut dyn FnMut(Event) -> bool) -> anyhow
     let judged = |image: &Rgb| score(image, &synthetic.truth, &judge);
     let scores = [judged(&plain)?, judged(&sharp_only)?, judged(&unshaken)?];
 
-    let shaken = baseline::merge(&synthetic.bracket, &response, &[frames.len() - 1]);
+    let shaken = as_taken(&frames[frames.len() - 1], &response, &synthetic.truth);
     let columns = [("SHAKEN, 2 S", &shaken), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp_only), ("UNSHAKEN", &unshaken)];
     write_png(&output_dir.join("before-after.png"), &comparison(&columns, &ToneMap::fit(&unshaken)))?;
     let mut report = outcome.report;
@@ -98,6 +98,20 @@ fn summary([plain, sharp_only, unshaken]: &[Score; 3], output_dir: &Path) -> Str
         unshaken.pu_psnr - sharp_only.pu_psnr,
         output_dir.display()
     )
+}
+
+/// Irradiance of one frame for the picture: white, as bright as the brightest thing of the scene, where the frame is clipped.
+pub fn as_taken(frame: &Frame, response: &Response, truth: &Rgb) -> Rgb {
+    let white = truth.0[1].data.iter().copied().fold(0.0, f32::max);
+    let mut out = frame.intensity.clone();
+    for i in 0..out.0[0].data.len() {
+        let z = frame.intensity.pixel(i);
+        let clipped = z.iter().all(|&v| v >= 1.0);
+        for c in 0..3 {
+            out.0[c].data[i] = if clipped { white } else { (response.inverse(c, f64::from(z[c])) / frame.exposure_time) as f32 };
+        }
+    }
+    out
 }
 
 /// The bracket's true TSFs as a TSF file.

@@ -177,7 +177,7 @@ fn look() {
     eprintln!("{:?} {:?}", t0.elapsed(), s.tsfs.iter().map(|t| t.poses.len()).collect::<Vec<_>>());
     let plain = baseline::merge(&s.bracket, &Response::Srgb, &[0, 1, 2, 3, 4]);
     let sharp = baseline::merge(&s.bracket, &Response::Srgb, &[0, 1, 2]);
-    let last = baseline::merge(&s.bracket, &Response::Srgb, &[4]);
+    let last = demo::as_taken(&s.bracket.frames()[4], &Response::Srgb, &s.truth);
     for i in [&plain, &sharp, &s.truth] {
         eprintln!("{:?}", metrics::score(i, &s.truth, &metrics::Judge { limit: Some(0.98 * 30.0), ..Default::default() }));
     }
