@@ -30,13 +30,13 @@ pub fn merge(bracket: &Bracket, response: &Response, frames: &[usize]) -> Rgb {
             } else {
                 f64::from((4.0 * level.min(1.0 - level)).clamp(1e-3, 1.0)) * frame.exposure_time
             };
-            for c in 0..3 {
-                sum[c] += weight * response.inverse(c, f64::from(z[c])) / frame.exposure_time;
+            for (c, sum) in sum.iter_mut().enumerate() {
+                *sum += weight * response.inverse(c, f64::from(z[c])) / frame.exposure_time;
             }
             total += weight;
         }
-        for c in 0..3 {
-            out.0[c].data[i] = (sum[c] / total.max(1e-30)) as f32;
+        for (plane, sum) in out.0.iter_mut().zip(sum) {
+            plane.data[i] = (sum / total.max(1e-30)) as f32;
         }
     }
     out

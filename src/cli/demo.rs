@@ -100,15 +100,16 @@ fn summary([plain, sharp_only, unshaken]: &[Score; 3], output_dir: &Path) -> Str
     )
 }
 
-/// Irradiance of one frame for the picture: white, as bright as the brightest thing of the scene, where the frame is clipped.
+/// Irradiance of one frame for the picture: towards clipping it turns to the scene's brightest white, as a photograph's does.
 pub fn as_taken(frame: &Frame, response: &Response, truth: &Rgb) -> Rgb {
     let white = truth.0[1].data.iter().copied().fold(0.0, f32::max);
     let mut out = frame.intensity.clone();
     for i in 0..out.0[0].data.len() {
         let z = frame.intensity.pixel(i);
-        let clipped = z.iter().all(|&v| v >= 1.0);
-        for c in 0..3 {
-            out.0[c].data[i] = if clipped { white } else { (response.inverse(c, f64::from(z[c])) / frame.exposure_time) as f32 };
+        let clipping = ((z.iter().sum::<f32>() / 3.0 - 0.92) / 0.08).clamp(0.0, 1.0).powi(2);
+        for (c, plane) in out.0.iter_mut().enumerate() {
+            let irradiance = (response.inverse(c, f64::from(z[c])) / frame.exposure_time) as f32;
+            plane.data[i] = irradiance.max(1e-6).powf(1.0 - clipping) * white.powf(clipping);
         }
     }
     out

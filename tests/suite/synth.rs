@@ -168,23 +168,3 @@ fn the_room_spans_almost_five_decades() {
     lum.sort_by(f32::total_cmp);
     assert!(lum[lum.len() - 1] / lum[0] > 5e4, "{} .. {}", lum[0], lum[lum.len() - 1]);
 }
-
-#[test]
-fn look() {
-    use unshaken::{baseline, cli::demo, metrics, tonemap::ToneMap};
-    let t0 = std::time::Instant::now();
-    let s = demo::bracket().unwrap();
-    eprintln!("{:?} {:?}", t0.elapsed(), s.tsfs.iter().map(|t| t.poses.len()).collect::<Vec<_>>());
-    let plain = baseline::merge(&s.bracket, &Response::Srgb, &[0, 1, 2, 3, 4]);
-    let sharp = baseline::merge(&s.bracket, &Response::Srgb, &[0, 1, 2]);
-    let last = demo::as_taken(&s.bracket.frames()[4], &Response::Srgb, &s.truth);
-    for i in [&plain, &sharp, &s.truth] {
-        eprintln!("{:?}", metrics::score(i, &s.truth, &metrics::Judge { limit: Some(0.98 * 30.0), ..Default::default() }));
-    }
-    demo::comparison(
-        &[("SHAKEN, 2 S", &last), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp), ("UNSHAKEN", &s.truth)],
-        &ToneMap::fit(&s.truth),
-    )
-    .save("/tmp/bash_jobs.0/cmp.png")
-    .unwrap();
-}
