@@ -9,7 +9,7 @@ use crate::exposure::{Bracket, Frame};
 use crate::image::{Plane, Rgb};
 use crate::response::Response;
 use crate::tsf::Tsf;
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 /// Sensor and response.
@@ -118,19 +118,23 @@ pub fn expose(scene: &Scene, tsf: &Tsf) -> Rgb {
         })
         .collect();
     let centre = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let last = ((sw - 2) as f64, (sh - 2) as f64);
     let to_scene: Vec<_> = tsf.poses.iter().map(|p| (p.homography(tsf.focal_px).inverse(), p.weight as f32)).collect();
     let mut pixels = vec![[0f32; 4]; width * height];
     pixels.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         for (h, weight) in &to_scene {
-            // Homogeneous scene point of the row's first pixel and its step per pixel.
-            let first = *h * DVec3::new(-centre.0, y as f64 - centre.1, 1.0);
-            let step = h.x_axis;
+            // Homogeneous sample position of the row's first pixel and its step per pixel. Sample 2k and 2k + 1 make pixel k,
+            // so the boxed sample at 2k is the pixel itself.
+            let origin = 2.0 * DVec2::new(centre.0 + scene.margin as f64, centre.1 + scene.margin as f64);
+            let to_samples = |q: DVec3| DVec3::new(2.0 * q.x + origin.x * q.z, 2.0 * q.y + origin.y * q.z, q.z);
+            let first = to_samples(*h * DVec3::new(-centre.0, y as f64 - centre.1, 1.0));
+            let step = to_samples(h.x_axis);
+            let flat = step.z == 0.0;
             for (x, out) in row.iter_mut().enumerate() {
                 let q = first + step * x as f64;
-                // Sample 2k and 2k + 1 make pixel k, so the boxed sample at 2k is the pixel itself.
-                let u = (2.0 * (q.x / q.z + centre.0 + scene.margin as f64)).clamp(0.0, (sw - 2) as f64);
-                let v = (2.0 * (q.y / q.z + centre.1 + scene.margin as f64)).clamp(0.0, (sh - 2) as f64);
-                let (i, j) = (u as usize, v as usize);
+                let q = if flat { q.truncate() / first.z } else { q.truncate() / q.z };
+                let (u, v) = (q.x.clamp(0.0, last.0), q.y.clamp(0.0, last.1));
+                let (i, j) = (u as u32 as usize, v as u32 as usize);
                 let (a, b) = ((u - i as f64) as f32, (v - j as f64) as f32);
                 let at = j * sw + i;
                 let (p, q) = (&boxed[at..at + 2], &boxed[at + sw..at + sw + 2]);

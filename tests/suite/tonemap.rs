@@ -31,6 +31,16 @@ fn awkward_images_give_pictures() {
 }
 
 #[test]
+fn a_channel_that_is_no_number_is_black() {
+    for bad in [f32::NAN, f32::INFINITY, -3.0] {
+        let mut image = Rgb::filled(6, 6, 1.0);
+        image.0[0].data[7] = bad;
+        let p = preview(&image).get_pixel(1, 1).0;
+        assert!(p[0] == 0 && p[1] > 60 && p[1] == p[2], "{bad}: {p:?}");
+    }
+}
+
+#[test]
 fn four_decades_show_at_once() {
     // Nine steps of half a decade, 24 px each, with a fine texture of 20 %.
     let level = |x: usize| 10f32.powf(0.5 * (x / 24) as f32 - 2.0);
