@@ -33,7 +33,7 @@ const CLOSE_UPS: [(u32, u32); 2] = [(372, 86), (16, 272)];
 /// frames are noisy.
 ///
 /// # Errors
-/// None that a caller could cause; see [`synth::capture`].
+/// None that a caller could cause; see [`synth::capture()`].
 pub fn bracket() -> crate::error::Result<SyntheticBracket> {
     let scene = synth::room(SIZE.0, SIZE.1, MARGIN, SEED);
     let shaken = |extent_px, roll_deg| Some(Tremor { extent_px, roll_deg, offset_px: 1.5, offset_deg: 0.1 });
