@@ -12,6 +12,7 @@
 //!    gradients on the GPU; K and its exact adjoint Kᵀ are the [`kernels`].
 //! 7. [`pipeline`]: these stages in order, from [`exposure::Bracket`] to irradiance and report.
 
+pub mod baseline;
 pub mod cli;
 pub mod deblur;
 pub mod error;

@@ -1,0 +1,189 @@
+//! `unshaken demo`: makes a shaken bracket of a scene drawn by the program, reconstructs it and shows what that gained.
+
+use crate::baseline;
+use crate::exposure::Frame;
+use crate::image::Rgb;
+use crate::metrics::{Judge, Score, score};
+use crate::pipeline::{self, Event, Settings};
+use crate::response::Response;
+use crate::synth::{self, Camera, SyntheticBracket, Tremor, font};
+use crate::tonemap::ToneMap;
+use crate::tsf::{TsfEntry, TsfFile};
+use anyhow::Context;
+use image::{RgbImage, imageops};
+use std::path::Path;
+
+/// Size of the demo's frames, pixels.
+const SIZE: (usize, usize) = (512, 384);
+/// Content beyond the frame that the shake can bring in, pixels.
+const MARGIN: usize = 48;
+/// Median luminance of the room: this part of white after 1 s. At 1/5 s that is 40 electrons, five times the read noise.
+const MEDIAN: f64 = 0.05;
+/// The seed of scene, shake and noise.
+const SEED: u64 = 1;
+/// One cell of the before/after picture, pixels.
+const CELL: (u32, u32) = (400, 300);
+/// Space between cells and height of a label's capitals, pixels.
+const GAP: u32 = 8;
+const LABEL: u32 = 15;
+/// Upper left corners of the close-ups, for frames of [`SIZE`]; each shows [`CELL`] / 3.
+const CLOSE_UPS: [(u32, u32); 2] = [(372, 86), (16, 272)];
+
+/// Makes the demo's bracket: 1/30, 1/8 and 1/5 s sharp, 1/2 and 2 s shaken; a dim room and a small sensor, so that the sharp
+/// frames are noisy.
+///
+/// # Errors
+/// None that a caller could cause; see [`synth::capture()`].
+pub fn bracket() -> crate::error::Result<SyntheticBracket> {
+    let scene = synth::room(SIZE.0, SIZE.1, MARGIN, SEED);
+    let shaken = |extent_px, roll_deg| Some(Tremor { extent_px, roll_deg, offset_px: 1.5, offset_deg: 0.1 });
+    let frames = [(1.0 / 30.0, None), (1.0 / 8.0, None), (1.0 / 5.0, None), (1.0 / 2.0, shaken(11.0, 0.9)), (2.0, shaken(18.0, 1.4))];
+    synth::capture(&scene, &Camera::default(), &frames, MEDIAN, SEED)
+}
+
+/// Runs the demo and writes everything to `output_dir`, which is made if need be; files of an earlier demo are replaced.
+/// `progress` hears the merge's events and can stop it by returning `false`.
+///
+/// # Errors
+/// What the merge reports, and files that cannot be written.
+pub fn run(output_dir: &Path, progress: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<()> {
+    std::fs::create_dir_all(output_dir)
+        .with_context(|| format!("{}: cannot be made; choose another --output-dir", output_dir.display()))?;
+    progress(Event::Progress { stage: "photographing a room at night".into(), fraction: 0.0 });
+    let synthetic = bracket()?;
+    let frames = synthetic.bracket.frames();
+    for frame in frames {
+        write_png(&output_dir.join(&frame.name), &codes(frame))?;
+    }
+    write_exr(&output_dir.join("truth.exr"), &synthetic.truth)?;
+    write_json(&output_dir.join("truth_tsf.json"), &serde_json::to_value(true_tsfs(&synthetic))?)?;
+
+    let response = Response::Srgb;
+    let outcome = pipeline::merge(&synthetic.bracket, &response, &Settings::default(), None, progress)?;
+    write_exr(&output_dir.join("unshaken.exr"), &outcome.irradiance)?;
+
+    let all: Vec<usize> = (0..frames.len()).collect();
+    let sharp: Vec<usize> = all.iter().copied().filter(|&i| synthetic.sharp[i]).collect();
+    let plain = baseline::merge(&synthetic.bracket, &response, &all);
+    let sharp_only = baseline::merge(&synthetic.bracket, &response, &sharp);
+    let seconds = frames[outcome.reference].exposure_time as f32;
+    let unshaken = outcome.irradiance.map_planes(|p| p.map(|v| v / seconds));
+    let shortest = frames.iter().map(|f| f.exposure_time).fold(f64::INFINITY, f64::min);
+    let judge = Judge { limit: Some((0.98 / shortest) as f32), ..Judge::default() };
+    let judged = |image: &Rgb| score(image, &synthetic.truth, &judge);
+    let scores = [judged(&plain)?, judged(&sharp_only)?, judged(&unshaken)?];
+
+    let shaken = as_taken(&frames[frames.len() - 1], &response, &synthetic.truth);
+    let columns = [("SHAKEN, 2 S", &shaken), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp_only), ("UNSHAKEN", &unshaken)];
+    write_png(&output_dir.join("before-after.png"), &comparison(&columns, &ToneMap::fit(&unshaken)))?;
+    let mut report = outcome.report;
+    if let Some(fields) = report.as_object_mut() {
+        let [plain, sharp_only, unshaken] = scores;
+        fields.insert("demo".into(), serde_json::json!({ "plain": plain, "sharp_only": sharp_only, "unshaken": unshaken }));
+    }
+    write_json(&output_dir.join("report.json"), &report)?;
+    println!("{}", summary(&scores, output_dir));
+    Ok(())
+}
+
+/// The demo's last words: scores of the plain merge, of the sharp frames alone, of the reconstruction.
+fn summary([plain, sharp_only, unshaken]: &[Score; 3], output_dir: &Path) -> String {
+    let line = |name: &str, s: &Score| format!("  {name:<28} {:5.1} dB   edges {:.2} of the truth's\n", s.pu_psnr, s.edge_ratio);
+    format!(
+        "PU21-PSNR against the true irradiance:\n{}{}{}gain: {:+.1} dB over the plain merge, {:+.1} dB over leaving the shaken frames out\nwritten to {}: before-after.png, unshaken.exr, report.json, the frames and the truth",
+        line("plain merge of all frames", plain),
+        line("merge of the sharp frames", sharp_only),
+        line("unshaken", unshaken),
+        unshaken.pu_psnr - plain.pu_psnr,
+        unshaken.pu_psnr - sharp_only.pu_psnr,
+        output_dir.display()
+    )
+}
+
+/// Irradiance of one frame for the picture: towards clipping it turns to the scene's brightest white, as a photograph's does.
+pub fn as_taken(frame: &Frame, response: &Response, truth: &Rgb) -> Rgb {
+    let white = truth.0[1].data.iter().copied().fold(0.0, f32::max);
+    let mut out = frame.intensity.clone();
+    for i in 0..out.0[0].data.len() {
+        let z = frame.intensity.pixel(i);
+        let clipping = ((z.iter().sum::<f32>() / 3.0 - 0.92) / 0.08).clamp(0.0, 1.0).powi(2);
+        for (c, plane) in out.0.iter_mut().enumerate() {
+            let irradiance = (response.inverse(c, f64::from(z[c])) / frame.exposure_time) as f32;
+            plane.data[i] = irradiance.max(1e-6).powf(1.0 - clipping) * white.powf(clipping);
+        }
+    }
+    out
+}
+
+/// The bracket's true TSFs as a TSF file.
+fn true_tsfs(synthetic: &SyntheticBracket) -> TsfFile {
+    let (width, height) = synthetic.bracket.size();
+    let entry = |(frame, tsf): (&Frame, &crate::tsf::Tsf)| TsfEntry {
+        frame: frame.name.clone(),
+        width,
+        height,
+        focal_px: tsf.focal_px,
+        poses: tsf.poses.clone(),
+    };
+    TsfFile::new(synthetic.bracket.frames().iter().zip(&synthetic.tsfs).map(entry).collect())
+}
+
+/// One column per image: label, the whole image, close-ups enlarged three times; all through one tone map.
+pub fn comparison(columns: &[(&str, &Rgb)], map: &ToneMap) -> RgbImage {
+    let top = LABEL + 2 * GAP;
+    let rows = 1 + CLOSE_UPS.len() as u32;
+    let (width, height) = (columns.len() as u32 * (CELL.0 + GAP) + GAP, top + rows * (CELL.1 + GAP));
+    let mut out = RgbImage::from_pixel(width, height, image::Rgb([24, 24, 26]));
+    for (i, (label, image)) in columns.iter().enumerate() {
+        let x = GAP + i as u32 * (CELL.0 + GAP);
+        write_text(&mut out, label, x as f32 + 2.0, GAP as f32, LABEL as f32);
+        let picture = map.apply(image);
+        let whole = imageops::resize(&picture, CELL.0, CELL.1, imageops::FilterType::CatmullRom);
+        imageops::replace(&mut out, &whole, i64::from(x), i64::from(top));
+        for (row, (u, v)) in CLOSE_UPS.into_iter().enumerate() {
+            let part = imageops::crop_imm(&picture, u, v, CELL.0 / 3, CELL.1 / 3).to_image();
+            let large = imageops::resize(&part, CELL.0, CELL.1, imageops::FilterType::CatmullRom);
+            imageops::replace(&mut out, &large, i64::from(x), i64::from(top + (row as u32 + 1) * (CELL.1 + GAP)));
+        }
+    }
+    out
+}
+
+/// Light text on dark ground; upper left corner at (x, y).
+fn write_text(image: &mut RgbImage, text: &str, x: f32, y: f32, height: f32) {
+    let radius = 0.07 * height;
+    for [a, b] in font::segments(text, height) {
+        let (a, b) = ((a.0 + x, a.1 + y), (b.0 + x, b.1 + y));
+        let range = |p: f32, q: f32, n: u32| ((p.min(q) - 2.0).max(0.0) as u32, ((p.max(q) + 3.0) as u32).min(n));
+        let ((x0, x1), (y0, y1)) = (range(a.0, b.0, image.width()), range(a.1, b.1, image.height()));
+        for v in y0..y1 {
+            for u in x0..x1 {
+                let cover = (radius + 0.5 - font::distance([a, b], u as f32, v as f32)).clamp(0.0, 1.0);
+                let pixel = &mut image.get_pixel_mut(u, v).0;
+                *pixel = pixel.map(|c| c.max((235.0 * cover) as u8));
+            }
+        }
+    }
+}
+
+/// The frame's 8-bit codes.
+fn codes(frame: &Frame) -> RgbImage {
+    let (width, height) = frame.intensity.size();
+    RgbImage::from_fn(width as u32, height as u32, |x, y| {
+        image::Rgb(frame.intensity.pixel(y as usize * width + x as usize).map(|v| (v * 255.0).round() as u8))
+    })
+}
+
+fn write_png(path: &Path, image: &RgbImage) -> anyhow::Result<()> {
+    image.save(path).with_context(|| format!("{}: cannot be written", path.display()))
+}
+
+fn write_exr(path: &Path, image: &Rgb) -> anyhow::Result<()> {
+    let (width, height) = image.size();
+    exr::prelude::write_rgb_file(path, width, height, |x, y| image.pixel(y * width + x).into())
+        .with_context(|| format!("{}: cannot be written", path.display()))
+}
+
+fn write_json(path: &Path, value: &serde_json::Value) -> anyhow::Result<()> {
+    std::fs::write(path, serde_json::to_string_pretty(value)?).with_context(|| format!("{}: cannot be written", path.display()))
+}
