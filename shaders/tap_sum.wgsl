@@ -1,9 +1,15 @@
-// The translations of the blur, eq. (4): out(p) = sum over taps of weight * in_plane(p - shift), zero outside `input`. A
-// fractional translation is its interpolation kernel splatted on integer shifts, so any number of poses costs as many taps
-// as the camera's path is pixels long. Forward: `input` holds the base warps, one group sums them all. Adjoint: mirrored
-// shifts, `input` is the frame, one group (invocation z) per base.
-// Taps come as runs of consecutive shifts in x and an invocation makes four pixels of a row: a run of n taps then costs
-// n + 3 loads for 4 n products (software rasterisers are bound by the number of loads).
+// The translations of the blur, eq. (4): out(p) = sum over taps of weight * in_plane(p - shift), zero outside `in`, three
+// channels at once. A fractional translation is its interpolation kernel splatted on integer shifts, so any number of poses
+// costs as many taps as the camera's path is pixels long. Forward: `in` holds the base warps and one invocation sums them
+// all. Adjoint: mirrored shifts, `in` is the frame, one group (invocation z) per base.
+//
+// Taps come as runs of consecutive shifts in x, and an invocation makes four pixels of a row: a block of four loads per
+// channel then serves sixteen products (software rasterisers are bound by the number of loads, real GPUs by L1).
+//
+// `table` starts with the group index, four entries to a vec4i: entry g is where group g begins, entry g + 1 where it ends.
+// A group is its runs one after another; a run is vec4i(plane, blocks, y, x) and its `blocks` vec4f of weights as bits.
+// (x, y) is the input pixel of the run's first load less the output pixel; load m of the run has weight t[m - k] in output
+// k = 0..3, where t is the run's weights in order, zero outside.
 struct Params {
     in_size: vec2i,
     out_size: vec2i,
@@ -11,24 +17,26 @@ struct Params {
     accumulate: u32,   // 1: add to what the output holds
     first_group: u32,  // group of invocations with z = 0
     span: u32,         // groups that one invocation sums
-    first_plane: u32,  // input plane that comes first in `input`
-}
-
-struct Run {
-    plane: u32,        // input plane
-    length: u32,
-    weight: u32,       // first weight; runs are padded by three zero weights on either side
-    y: i32,            // input row less output row (origin included by the kernel)
-    x: i32,            // input column, less output column, of the last tap: the smallest
-    _pad: u32,
+    first_plane: u32,  // input plane that comes first in `in`
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> groups: array<u32>;  // first run of each group, and the end of the last
-@group(0) @binding(2) var<storage, read> runs: array<Run>;
-@group(0) @binding(3) var<storage, read> weights: array<f32>;
-@group(0) @binding(4) var<storage, read> input: array<f32>;
-@group(0) @binding(5) var<storage, read_write> output: array<f32>;
+@group(0) @binding(1) var<storage, read> table: array<vec4i>;
+@group(0) @binding(2) var<storage, read> in_r: array<f32>;
+@group(0) @binding(3) var<storage, read> in_g: array<f32>;
+@group(0) @binding(4) var<storage, read> in_b: array<f32>;
+@group(0) @binding(5) var<storage, read_write> out_r: array<f32>;
+@group(0) @binding(6) var<storage, read_write> out_g: array<f32>;
+@group(0) @binding(7) var<storage, read_write> out_b: array<f32>;
+
+fn products(v: vec4f, last: vec4f, now: vec4f) -> vec4f {
+    return vec4f(
+        dot(v, now),
+        dot(v, vec4f(last.w, now.xyz)),
+        dot(v, vec4f(last.zw, now.xy)),
+        dot(v, vec4f(last.yzw, now.x)),
+    );
+}
 
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u) {
@@ -37,38 +45,66 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         return;
     }
     let in_plane = params.in_size.x * params.in_size.y;
-    var sum = vec4f(0.0);
-    for (var k = groups[params.first_group + id.z]; k < groups[params.first_group + id.z + params.span]; k += 1u) {
-        let run = runs[k];
-        let y = p.y + params.origin.y + run.y;
-        if y < 0 || y >= params.in_size.y {
-            continue;
-        }
-        let row = i32(run.plane - params.first_plane) * in_plane + y * params.in_size.x;
-        let x0 = p.x + params.origin.x + run.x;
-        let n = i32(run.length);
-        // w holds the weights that the pixel loaded now has in the four outputs.
-        var w = vec4f(0.0);
-        if x0 >= 0 && x0 + n + 3 <= params.in_size.x {
-            for (var m = 0; m < n + 3; m += 1) {
-                w = vec4f(weights[i32(run.weight) + n + 2 - m], w.xyz);
-                sum += input[row + x0 + m] * w;
-            }
-        } else {
-            for (var m = 0; m < n + 3; m += 1) {
-                w = vec4f(weights[i32(run.weight) + n + 2 - m], w.xyz);
-                let x = x0 + m;
-                if x >= 0 && x < params.in_size.x {
-                    sum += input[row + x] * w;
+    let g = params.first_group + id.z;
+    let h = g + params.span;
+    var k = table[g / 4u][g % 4u];
+    let end = table[h / 4u][h % 4u];
+    var red = vec4f(0.0);
+    var green = vec4f(0.0);
+    var blue = vec4f(0.0);
+    while k < end {
+        let run = table[k];
+        k += 1;
+        let blocks = run.y;
+        let y = p.y + params.origin.y + run.z;
+        let x0 = p.x + params.origin.x + run.w;
+        if y >= 0 && y < params.in_size.y {
+            let row = (run.x - i32(params.first_plane)) * in_plane + y * params.in_size.x;
+            var last = vec4f(0.0);
+            if x0 >= 0 && x0 + 4 * blocks <= params.in_size.x {
+                var i = row + x0;
+                for (var b = 0; b < blocks; b += 1) {
+                    let now = bitcast<vec4f>(table[k + b]);
+                    red += products(vec4f(in_r[i], in_r[i + 1], in_r[i + 2], in_r[i + 3]), last, now);
+                    green += products(vec4f(in_g[i], in_g[i + 1], in_g[i + 2], in_g[i + 3]), last, now);
+                    blue += products(vec4f(in_b[i], in_b[i + 1], in_b[i + 2], in_b[i + 3]), last, now);
+                    last = now;
+                    i += 4;
+                }
+            } else {
+                for (var b = 0; b < blocks; b += 1) {
+                    let now = bitcast<vec4f>(table[k + b]);
+                    var v = array<vec4f, 3>(vec4f(0.0), vec4f(0.0), vec4f(0.0));
+                    for (var c = 0; c < 4; c += 1) {
+                        let x = x0 + 4 * b + c;
+                        if x >= 0 && x < params.in_size.x {
+                            v[0][c] = in_r[row + x];
+                            v[1][c] = in_g[row + x];
+                            v[2][c] = in_b[row + x];
+                        }
+                    }
+                    red += products(v[0], last, now);
+                    green += products(v[1], last, now);
+                    blue += products(v[2], last, now);
+                    last = now;
                 }
             }
         }
+        k += blocks;
     }
     let o = i32(id.z) * params.out_size.x * params.out_size.y + p.y * params.out_size.x + p.x;
     for (var c = 0; c < 4; c += 1) {
         // Each pixel has its own guard: an overrun would write into the next row.
         if p.x + c < params.out_size.x {
-            output[o + c] = select(0.0, output[o + c], params.accumulate == 1u) + sum[c];
+            if params.accumulate == 1u {
+                out_r[o + c] += red[c];
+                out_g[o + c] += green[c];
+                out_b[o + c] += blue[c];
+            } else {
+                out_r[o + c] = red[c];
+                out_g[o + c] = green[c];
+                out_b[o + c] = blue[c];
+            }
         }
     }
 }

@@ -59,17 +59,6 @@ struct BaseTable {
     def_inverse: [f32; 4],
 }
 
-#[repr(C)]
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct Run {
-    plane: u32,
-    length: u32,
-    weight: u32,
-    y: i32,
-    x: i32,
-    _pad: u32,
-}
-
 pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
     vec![("warp", size_of::<WarpParams>()), ("warp_adjoint", size_of::<WarpAdjointParams>()), ("tap_sum", size_of::<TapParams>())]
 }
@@ -142,30 +131,33 @@ pub struct Blur {
     bases: usize,
     reach: i32,
     base_table: wgpu::Buffer,
-    forward_taps: TapTables,
-    adjoint_taps: TapTables,
+    forward_taps: wgpu::Buffer,
+    adjoint_taps: wgpu::Buffer,
 }
 
-struct TapTables {
-    groups: wgpu::Buffer,
-    runs: wgpu::Buffer,
-    weights: wgpu::Buffer,
-}
-
-/// Runs of consecutive shifts in x from taps sorted by (dy, dx); `mirror` makes the adjoint's.
-fn runs_of(taps: &[(i32, i32, f64)], plane: u32, runs: &mut Vec<Run>, weights: &mut Vec<f32>) {
-    let mut i = 0;
-    while i < taps.len() {
-        let mut n = 1;
-        while i + n < taps.len() && taps[i + n].0 == taps[i].0 && taps[i + n].1 == taps[i].1 + n as i32 {
-            n += 1;
-        }
-        runs.push(Run { plane, length: n as u32, weight: weights.len() as u32, y: -taps[i].0, x: -(taps[i].1 + n as i32 - 1), _pad: 0 });
-        weights.extend([0.0; 3]);
-        weights.extend(taps[i..i + n].iter().map(|t| t.2 as f32));
-        weights.extend([0.0; 3]);
-        i += n;
+/// Appends the runs of consecutive shifts in x of taps sorted by (dy, dx), in the layout of shaders/tap_sum.wgsl.
+fn append_runs(taps: &[(i32, i32, f64)], plane: i32, table: &mut Vec<[i32; 4]>) {
+    for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
+        // Load m is at p - dx with dx descending: weight t[m] belongs to the m-th largest shift.
+        let (dy, dx) = (run[0].0, run[run.len() - 1].1);
+        let blocks = (run.len() + 3).div_ceil(4);
+        table.push([plane, blocks as i32, -dy, -dx]);
+        let weight = |m: usize| run.len().checked_sub(m + 1).map_or(0, |i| (run[i].2 as f32).to_bits() as i32);
+        table.extend((0..blocks).map(|b| std::array::from_fn(|c| weight(4 * b + c))));
     }
+}
+
+/// Group index and runs of all groups.
+fn tap_table(groups: &[(i32, Vec<(i32, i32, f64)>)]) -> Vec<[i32; 4]> {
+    let head = (groups.len() + 1).div_ceil(4);
+    let mut table = vec![[0i32; 4]; head];
+    for (g, (plane, taps)) in groups.iter().enumerate() {
+        table[g / 4][g % 4] = table.len() as i32;
+        append_runs(taps, *plane, &mut table);
+    }
+    let (n, end) = (groups.len(), table.len() as i32);
+    table[n / 4][n % 4] = end;
+    table
 }
 
 impl Blur {
@@ -190,18 +182,8 @@ impl Blur {
             t.sort_by_key(|t| (t.0, t.1));
             t
         };
-        let tables = |sign: i32| {
-            let (mut groups, mut runs, mut weights) = (vec![0u32], Vec::new(), Vec::new());
-            for b in 0..taps.bases.len() {
-                runs_of(&of_base(b, sign), if sign > 0 { b as u32 } else { 0 }, &mut runs, &mut weights);
-                groups.push(runs.len() as u32);
-            }
-            (groups, runs, weights)
-        };
-        let upload = |(groups, runs, weights): (Vec<u32>, Vec<Run>, Vec<f32>)| TapTables {
-            groups: gpu.table("tap groups", &groups),
-            runs: gpu.table("tap runs", &runs),
-            weights: gpu.table("tap weights", &weights),
+        let groups = |sign: i32| -> Vec<_> {
+            (0..taps.bases.len()).map(|b| (if sign > 0 { b as i32 } else { 0 }, of_base(b, sign))).collect()
         };
         Self {
             latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
@@ -212,8 +194,8 @@ impl Blur {
             bases: taps.bases.len(),
             reach,
             base_table: gpu.table("base warps", &table),
-            forward_taps: upload(tables(1)),
-            adjoint_taps: upload(tables(-1)),
+            forward_taps: gpu.table("taps", &tap_table(&groups(1))),
+            adjoint_taps: gpu.table("mirrored taps", &tap_table(&groups(-1))),
         }
     }
 
@@ -252,20 +234,17 @@ impl Blur {
             let s = &scratch.planes;
             let buffers = [&self.base_table, &latent[0], &latent[1], &latent[2], &s[0], &s[1], &s[2]];
             steps.push(kernels.warp.step_2d(gpu, &self.warp_params(first, n), &buffers, self.scratch_size, n));
-            for c in 0..3 {
-                let params = TapParams {
-                    in_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
-                    out_size: [self.frame.0 as i32, self.frame.1 as i32],
-                    origin: [-self.origin[0], -self.origin[1]],
-                    accumulate: u32::from(first > 0),
-                    first_group: first as u32,
-                    span: n as u32,
-                    first_plane: first as u32,
-                };
-                let t = &self.forward_taps;
-                let buffers = [&t.groups, &t.runs, &t.weights, &s[c], &frame[c]];
-                steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.frame.0.div_ceil(4), self.frame.1), 1));
-            }
+            let params = TapParams {
+                in_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
+                out_size: [self.frame.0 as i32, self.frame.1 as i32],
+                origin: [-self.origin[0], -self.origin[1]],
+                accumulate: u32::from(first > 0),
+                first_group: first as u32,
+                span: n as u32,
+                first_plane: first as u32,
+            };
+            let buffers = [&self.forward_taps, &s[0], &s[1], &s[2], &frame[0], &frame[1], &frame[2]];
+            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.frame.0.div_ceil(4), self.frame.1), 1));
         }
         steps
     }
@@ -283,20 +262,17 @@ impl Blur {
         let mut steps = Vec::new();
         for (first, n) in self.passes(scratch) {
             let s = &scratch.planes;
-            for c in 0..3 {
-                let params = TapParams {
-                    in_size: [self.frame.0 as i32, self.frame.1 as i32],
-                    out_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
-                    origin: self.origin,
-                    accumulate: 0,
-                    first_group: first as u32,
-                    span: 1,
-                    first_plane: 0,
-                };
-                let t = &self.adjoint_taps;
-                let buffers = [&t.groups, &t.runs, &t.weights, &frame[c], &s[c]];
-                steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.scratch_size.0.div_ceil(4), self.scratch_size.1), n));
-            }
+            let params = TapParams {
+                in_size: [self.frame.0 as i32, self.frame.1 as i32],
+                out_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
+                origin: self.origin,
+                accumulate: 0,
+                first_group: first as u32,
+                span: 1,
+                first_plane: 0,
+            };
+            let buffers = [&self.adjoint_taps, &frame[0], &frame[1], &frame[2], &s[0], &s[1], &s[2]];
+            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.scratch_size.0.div_ceil(4), self.scratch_size.1), n));
             let params = WarpAdjointParams { warp: self.warp_params(first, n), reach: self.reach, factor };
             let buffers = [&self.base_table, &s[0], &s[1], &s[2], &latent[0], &latent[1], &latent[2]];
             steps.push(kernels.warp_adjoint.step_2d(gpu, &params, &buffers, self.latent, 1));

@@ -84,9 +84,10 @@ pub struct TapSet {
     pub taps: Vec<Tap>,
 }
 
-/// Poses whose rotations differ by less than this at the worst pixel share a base warp: a quarter of a pixel is below what
-/// the interpolation itself blurs (its error on real images is an order above that of a 1/4 px displacement split linearly).
-const TOLERANCE: f64 = 0.5;
+/// Angle between base warps, as the displacement of the worst pixel: a pose takes the nearest base, so that no pixel is off by more
+/// than half of this, and the errors of a path's many poses average out. Splitting a pose between two bases would double the taps
+/// for no smaller error (it blurs by as much).
+const TOLERANCE: f64 = 0.6;
 
 /// Taps below this fraction of the largest are dropped: together they are below the 8-bit quantisation of any pixel.
 const NEGLIGIBLE: f64 = 5e-4;
@@ -134,7 +135,7 @@ pub(super) fn splat(interpolation: Interpolation, t: DVec2, mut f: impl FnMut(i3
 
 type Parts = (Vec<DMat3>, Vec<(usize, DVec2, f64)>);
 
-/// Equally spaced roll angles; each pose is split linearly between its two neighbours.
+/// Equally spaced roll angles; each pose takes the nearest.
 fn roll_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
     let corner = 0.5 * (width as f64).hypot(height as f64);
     let (lo, hi) = tsf.poses.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), p| (a.min(p.theta_z_deg), b.max(p.theta_z_deg)));
@@ -143,14 +144,8 @@ fn roll_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
     let bases = (0..=steps).map(|i| Pose::planar(0.0, 0.0, lo + i as f64 * step, 1.0).rotation(tsf.focal_px)).collect();
     let mut parts = Vec::new();
     for p in &tsf.poses {
-        let s = ((p.theta_z_deg - lo) / step).clamp(0.0, steps as f64);
-        let i = (s as usize).min(steps.saturating_sub(1));
-        let f = s - i as f64;
-        let t = DVec2::new(p.t_x, p.t_y);
-        parts.push((i, t, p.weight * (1.0 - f)));
-        if f > 0.0 {
-            parts.push((i + 1, t, p.weight * f));
-        }
+        let i = ((p.theta_z_deg - lo) / step).round().clamp(0.0, steps as f64) as usize;
+        parts.push((i, DVec2::new(p.t_x, p.t_y), p.weight));
     }
     (bases, parts)
 }
