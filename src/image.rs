@@ -83,7 +83,9 @@ impl Plane {
 
     /// The plane with `pad` more pixels on every side, each a copy of the nearest edge pixel.
     pub fn padded(&self, pad: usize) -> Self {
-        Self::from_fn(self.width + 2 * pad, self.height + 2 * pad, |x, y| self.clamped(x as isize - pad as isize, y as isize - pad as isize))
+        Self::from_fn(self.width + 2 * pad, self.height + 2 * pad, |x, y| {
+            self.clamped(x as isize - pad as isize, y as isize - pad as isize)
+        })
     }
 }
 

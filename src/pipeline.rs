@@ -54,7 +54,13 @@ pub struct Outcome {
 ///
 /// # Errors
 /// [`crate::error::Error::Input`] for settings or TSFs that do not fit the bracket, `Cancelled`, and the GPU's errors.
-pub fn merge(bracket: &Bracket, response: &Response, settings: &Settings, given: Option<&TsfFile>, events: &mut dyn FnMut(Event) -> bool) -> Result<Outcome> {
+pub fn merge(
+    bracket: &Bracket,
+    response: &Response,
+    settings: &Settings,
+    given: Option<&TsfFile>,
+    events: &mut dyn FnMut(Event) -> bool,
+) -> Result<Outcome> {
     let _ = (bracket, response, settings, given, events);
     Err(crate::error::Error::Cancelled)
 }

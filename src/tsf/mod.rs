@@ -102,8 +102,9 @@ impl TsfFile {
     /// # Errors
     /// [`Error::Input`] for text that is not such a file.
     pub fn parse(text: &str) -> Result<Self> {
-        let file: Self = serde_json::from_str(text)
-            .map_err(|e| Error::Input(format!("is not a TSF file ({e}); expected {{\"format\":\"unshaken-tsf\",\"version\":1,\"frames\":[...]}}")))?;
+        let file: Self = serde_json::from_str(text).map_err(|e| {
+            Error::Input(format!("is not a TSF file ({e}); expected {{\"format\":\"unshaken-tsf\",\"version\":1,\"frames\":[...]}}"))
+        })?;
         if file.format != Self::FORMAT || file.version != Self::VERSION {
             return Err(Error::Input(format!(
                 "has format {:?} version {}; expected format \"unshaken-tsf\" version 1",
