@@ -24,12 +24,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
     let response = match (named, response_file) {
         (Some(response), _) => response,
         (None, Some(path)) => read_response(path)?,
-        (None, None) => {
-            super::warn(
-                "no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it",
-            );
-            Response::Srgb
-        }
+        (None, None) => Response::Srgb,
     };
     let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
     if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
@@ -39,6 +34,10 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
     let mut progress = Progress::new();
     progress.at("reading frames", 0.0);
     let bracket = frames::read(&args.frames, times)?;
+    if args.response.is_none() {
+        progress
+            .warn("no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it");
+    }
     let mut events = |event| {
         match event {
             Event::Progress { stage, fraction } => progress.at(&stage, fraction),

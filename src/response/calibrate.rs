@@ -187,12 +187,12 @@ fn extend_bright_end(g: &mut [f64]) {
     let n = (LAST - FIRST + 1) as f64;
     let (mean_z, mean_g) = ((FIRST + LAST) as f64 / 2.0, g[FIRST..=LAST].iter().sum::<f64>() / n);
     let (mut zg, mut zz) = (0.0, 0.0);
-    for z in FIRST..=LAST {
-        zg += (z as f64 - mean_z) * (g[z] - mean_g);
+    for (z, v) in g.iter().enumerate().take(LAST + 1).skip(FIRST) {
+        zg += (z as f64 - mean_z) * (v - mean_g);
         zz += (z as f64 - mean_z).powi(2);
     }
-    for z in LAST + 1..CODES {
-        g[z] = mean_g + (zg / zz).max(0.0) * (z as f64 - mean_z);
+    for (z, v) in g.iter_mut().enumerate().skip(LAST + 1) {
+        *v = mean_g + (zg / zz).max(0.0) * (z as f64 - mean_z);
     }
 }
 
