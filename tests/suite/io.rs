@@ -243,11 +243,12 @@ fn outputs_and_inputs_are_distinct_files() {
     let dir = tempdir().unwrap();
     let (a, b) = (dir.path().join("a"), dir.path().join("b"));
     std::fs::write(&a, "").unwrap();
-    let other = dir.path().join(".").join("b");
+    std::fs::create_dir(dir.path().join("sub")).unwrap();
+    let other = dir.path().join("sub/../b");
     assert!(output::check_distinct(&[("--output", &b)], &[("frame", &a)]).is_ok());
     let error = output::check_distinct(&[("--output", &b), ("--report", &other)], &[]).unwrap_err().to_string();
     assert!(error.contains("both --output and --report"), "{error}");
-    let again = dir.path().join(".").join("a");
+    let again = dir.path().join("sub/../a");
     let error = output::check_distinct(&[("--output", &again)], &[("frame", &a)]).unwrap_err().to_string();
     assert!(error.contains("--output would replace the frame"), "{error}");
 }
