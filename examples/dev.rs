@@ -9,7 +9,12 @@ fn main() {
         let im = image::open(format!("{dir}/{}", f.as_str().unwrap())).unwrap().to_rgb8();
         let (w, h) = im.dimensions();
         let ch = |c: usize| Plane::from_fn(w as usize, h as usize, |x, y| im.get_pixel(x as u32, y as u32)[c] as f32 / 255.0);
-        frames.push(Frame { name: f.as_str().unwrap().into(), intensity: Rgb([ch(0), ch(1), ch(2)]), levels: 255, exposure_time: t.as_f64().unwrap() });
+        frames.push(Frame {
+            name: f.as_str().unwrap().into(),
+            intensity: Rgb([ch(0), ch(1), ch(2)]),
+            levels: 255,
+            exposure_time: t.as_f64().unwrap(),
+        });
     }
     let bracket = Bracket::new(frames).unwrap();
     let mut s = pipeline::Settings::default();
@@ -32,10 +37,21 @@ fn main() {
         }
     }
     let t0 = std::time::Instant::now();
-    let out = pipeline::merge(&bracket, &resp, &s, tsf.as_ref(), &mut |e| { match &e { pipeline::Event::Warning(w) => eprintln!("warning: {w}"), pipeline::Event::Progress{stage,fraction} => eprintln!("{:.1} {stage} {fraction:.2}", t0.elapsed().as_secs_f64()) }; true }).unwrap();
+    let out = pipeline::merge(&bracket, &resp, &s, tsf.as_ref(), &mut |e| {
+        match &e {
+            pipeline::Event::Warning(w) => eprintln!("warning: {w}"),
+            pipeline::Event::Progress { stage, fraction } => eprintln!("{:.1} {stage} {fraction:.2}", t0.elapsed().as_secs_f64()),
+        };
+        true
+    })
+    .unwrap();
     eprintln!("{:.1} s", t0.elapsed().as_secs_f64());
     let mut bytes = vec![];
-    for i in 0..out.irradiance.0[0].data.len() { for c in 0..3 { bytes.extend(out.irradiance.0[c].data[i].to_le_bytes()); } }
+    for i in 0..out.irradiance.0[0].data.len() {
+        for c in 0..3 {
+            bytes.extend(out.irradiance.0[c].data[i].to_le_bytes());
+        }
+    }
     std::fs::write(&a[2], bytes).unwrap();
     std::fs::write(format!("{}.json", a[2]), serde_json::to_string(&out.report).unwrap()).unwrap();
 }

@@ -1,8 +1,81 @@
-//! The command line.
+//! The command line: arguments, one file per command, progress. The only place that prints.
+//!
+//! Exit code 0: done; 1: failed; 2: the command line itself is wrong. An error is one line on standard error.
 
+mod adapters;
+mod args;
+mod calibrate;
 pub mod demo;
+mod frames;
+mod merge;
+mod progress;
 
-/// Runs the program.
-pub fn run() -> std::process::ExitCode {
-    std::process::ExitCode::SUCCESS
+use crate::pipeline::Event;
+use clap::Parser;
+use std::process::ExitCode;
+
+/// The command line itself is wrong: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct Usage(String);
+
+/// Runs the program on the process's arguments.
+pub fn run() -> ExitCode {
+    let line = match args::CommandLine::try_parse() {
+        Ok(line) => line,
+        Err(e) if !e.use_stderr() => {
+            // Help and version; nothing is left to do if even they cannot be printed.
+            let _ = e.print();
+            return ExitCode::SUCCESS;
+        }
+        Err(e) => return report(&usage_of(&e).into()),
+    };
+    let done = match line.command {
+        args::Command::Merge(a) => merge::run(&a),
+        args::Command::Calibrate(a) => calibrate::run(&a),
+        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)),
+        args::Command::Adapters => adapters::run(),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => report(&e),
+    }
+}
+
+/// Runs a job whose events go to the progress bar and to warnings.
+fn with_progress<T>(job: impl FnOnce(&mut dyn FnMut(Event) -> bool) -> anyhow::Result<T>) -> anyhow::Result<T> {
+    let mut progress = progress::Progress::new();
+    job(&mut |event| {
+        match event {
+            Event::Progress { stage, fraction } => progress.at(&stage, fraction),
+            Event::Warning(text) => progress.warn(&text),
+        }
+        true
+    })
+}
+
+fn report(e: &anyhow::Error) -> ExitCode {
+    eprintln!("error: {}", one_line(&format!("{e:#}")));
+    ExitCode::from(if e.is::<Usage>() { 2 } else { 1 })
+}
+
+fn warn(text: &str) {
+    eprintln!("warning: {}", one_line(text));
+}
+
+/// The parser's message in one line: its first paragraph, and its tips. Without arguments the parser would print all
+/// of the help.
+fn usage_of(e: &clap::Error) -> Usage {
+    use clap::error::ErrorKind;
+    if matches!(e.kind(), ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand) {
+        return Usage("no command; try 'unshaken demo', 'unshaken merge -o OUT.exr FRAME...' or 'unshaken --help'".into());
+    }
+    let text = e.render().to_string();
+    let first = text.split("\n\n").next().unwrap_or_default();
+    let tips = text.lines().map(str::trim).filter(|l| l.starts_with("tip:")).map(|l| format!("; {l}")).collect::<String>();
+    Usage(format!("{}{tips}; see 'unshaken --help'", one_line(first.strip_prefix("error: ").unwrap_or(first))))
+}
+
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -182,9 +182,8 @@ impl Blur {
             t.sort_by_key(|t| (t.0, t.1));
             t
         };
-        let groups = |sign: i32| -> Vec<_> {
-            (0..taps.bases.len()).map(|b| (if sign > 0 { b as i32 } else { 0 }, of_base(b, sign))).collect()
-        };
+        let groups =
+            |sign: i32| -> Vec<_> { (0..taps.bases.len()).map(|b| (if sign > 0 { b as i32 } else { 0 }, of_base(b, sign))).collect() };
         Self {
             latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
             frame,

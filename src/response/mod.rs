@@ -1,5 +1,13 @@
 //! Camera response f and its inverse: irradiance B = f⁻¹(Z)/Δt (section II-A). No blur.
 
+mod calibrate;
+mod file;
+
+pub use calibrate::calibrate;
+pub use file::{InverseTables, Provenance, ResponseFile};
+
+use crate::error::{Error, Result};
+
 /// Camera response f, per channel, normalised so that f(0) = 0 and f(1) = 1.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Response {
@@ -14,6 +22,34 @@ pub enum Response {
 }
 
 impl Response {
+    /// The response that `word` names: `srgb`, `linear` or `gamma:2.2`; `None` for other words (names of files).
+    ///
+    /// # Errors
+    /// [`Error::Input`] for a γ that is not a number from 0.1 to 10.
+    pub fn named(word: &str) -> Result<Option<Self>> {
+        match word {
+            "srgb" => Ok(Some(Self::Srgb)),
+            "linear" => Ok(Some(Self::Linear)),
+            _ => {
+                let Some(number) = word.strip_prefix("gamma:") else { return Ok(None) };
+                match number.parse::<f64>() {
+                    Ok(g) if (0.1..=10.0).contains(&g) => Ok(Some(Self::Gamma(g))),
+                    _ => Err(Error::Input(format!("{number:?} is not a gamma; give a number from 0.1 to 10, such as gamma:2.2"))),
+                }
+            }
+        }
+    }
+
+    /// What it is called: `srgb`, `linear`, `gamma:2.2`, or `table` for a calibrated one.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Srgb => "srgb".into(),
+            Self::Linear => "linear".into(),
+            Self::Gamma(g) => format!("gamma:{g}"),
+            Self::Table(_) => "table".into(),
+        }
+    }
+
     /// f⁻¹: relative exposure x = E Δt (1 is white) of intensity `z` in 0..=1.
     pub fn inverse(&self, channel: usize, z: f64) -> f64 {
         let z = z.clamp(0.0, 1.0);

@@ -1,0 +1,87 @@
+//! The command line.
+
+use clap::{Args, Parser, Subcommand};
+use std::path::PathBuf;
+
+/// Turns a hand-held exposure bracket with camera shake into one sharp HDR irradiance image.
+#[derive(Debug, Parser)]
+#[command(name = "unshaken", version, about)]
+pub(super) struct CommandLine {
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// Reconstruct the sharp irradiance of a bracket
+    Merge(MergeArgs),
+    /// Measure the camera's response from an unblurred bracket (tripod), for merge --response
+    Calibrate(CalibrateArgs),
+    /// Make a shaken bracket, reconstruct it, and show what was gained
+    Demo(DemoArgs),
+    /// List the GPU adapters and the one that would be used
+    Adapters,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct MergeArgs {
+    /// Frames of one scene (PNG, JPEG or TIFF, 8 or 16 bits), counted from 1
+    #[arg(required = true, value_name = "FRAME")]
+    pub frames: Vec<PathBuf>,
+    /// Irradiance as linear 32-bit float OpenEXR; 1.0 is the white of the reference frame
+    #[arg(short, long, value_name = "OUT.exr")]
+    pub output: PathBuf,
+    /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
+    #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
+    pub exposures: Option<String>,
+    /// Camera response: srgb, linear, gamma:2.2, or a file from 'unshaken calibrate' [default: srgb, with a warning]
+    #[arg(long, value_name = "NAME|FILE.json")]
+    pub response: Option<String>,
+    /// Frame on whose pixel grid the result lies [default: the longest sharp frame]
+    #[arg(long, value_name = "N", allow_hyphen_values = true)]
+    pub reference: Option<String>,
+    /// These frames are sharp [default: found out]
+    #[arg(long, value_name = "N,N,...", allow_hyphen_values = true)]
+    pub sharp: Option<String>,
+    /// Leave these frames out
+    #[arg(long, value_name = "N,N,...", allow_hyphen_values = true)]
+    pub exclude: Option<String>,
+    /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
+    #[arg(long, value_name = "A", allow_hyphen_values = true)]
+    pub alpha: Option<String>,
+    /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
+    #[arg(long, value_name = "FILE.json")]
+    pub tsf: Option<PathBuf>,
+    /// Write a tone-mapped picture of the result
+    #[arg(long, value_name = "OUT.png")]
+    pub preview: Option<PathBuf>,
+    /// Write everything that was estimated and how well it fits
+    #[arg(long, value_name = "OUT.json")]
+    pub report: Option<PathBuf>,
+    /// Replace outputs that exist
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct CalibrateArgs {
+    /// Frames of one scene without shake (PNG, JPEG or TIFF), at two or more exposure times
+    #[arg(required = true, value_name = "FRAME")]
+    pub frames: Vec<PathBuf>,
+    /// Response file to write
+    #[arg(short, long, value_name = "RESPONSE.json")]
+    pub output: PathBuf,
+    /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
+    #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
+    pub exposures: Option<String>,
+    /// Replace an output that exists
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct DemoArgs {
+    /// Folder for the results
+    #[arg(long, value_name = "DIR", default_value = "unshaken-demo")]
+    pub output_dir: PathBuf,
+}

@@ -1,0 +1,181 @@
+//! `unshaken merge`.
+
+use super::args::MergeArgs;
+use super::progress::Progress;
+use super::{Usage, frames};
+use crate::error::Error;
+use crate::exposure::Bracket;
+use crate::io::exr::Radiometry;
+use crate::io::output::{self, Output};
+use crate::pipeline::{self, Event, Settings};
+use crate::response::{Response, ResponseFile};
+use crate::tsf::TsfFile;
+use std::path::{Path, PathBuf};
+
+pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
+    // Everything that can be refused without reading pixels comes first: a merge takes a while.
+    let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
+    let settings = settings(args)?;
+    frames::check(&args.frames)?;
+    let named = args.response.as_deref().map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
+    let response_file = args.response.as_deref().filter(|_| named.is_none()).map(Path::new);
+    let (exr, preview, report) = outputs(args, response_file)?;
+
+    let response = match (named, response_file) {
+        (Some(response), _) => response,
+        (None, Some(path)) => read_response(path)?,
+        (None, None) => Response::Srgb,
+    };
+    let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
+    if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
+        check_tsf_names(file, path, &args.frames)?;
+    }
+
+    let mut progress = Progress::new();
+    progress.at("reading frames", 0.0);
+    let bracket = frames::read(&args.frames, times)?;
+    if args.response.is_none() {
+        progress
+            .warn("no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it");
+    }
+    let mut events = |event| {
+        match event {
+            Event::Progress { stage, fraction } => progress.at(&stage, fraction),
+            Event::Warning(text) => progress.warn(&text),
+        }
+        true
+    };
+    let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), &mut events)?;
+    progress.at("writing", 1.0);
+
+    // All are complete before the first is renamed.
+    let reference = &bracket.frames()[outcome.reference];
+    let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
+    let mut staged = vec![exr.stage_exr(&outcome.irradiance, &radiometry)?];
+    if let Some(target) = &preview {
+        staged.push(target.stage_png(&crate::tonemap::preview(&outcome.irradiance))?);
+    }
+    if let Some(target) = &report {
+        staged.push(target.stage_json(&outcome.report)?);
+    }
+    for s in staged {
+        s.commit()?;
+    }
+    drop(progress);
+    println!("{}", summary(args, &bracket, outcome.reference));
+    Ok(())
+}
+
+fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
+    let (width, height) = bracket.size();
+    let frame = &bracket.frames()[reference];
+    format!(
+        "wrote {} ({width} x {height}; 1.0 is the white of frame {}, {}, at {} s)",
+        args.output.display(),
+        reference + 1,
+        frame.name,
+        frame.exposure_time
+    )
+}
+
+fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
+    let n = args.frames.len();
+    let mut settings = Settings::default();
+    if let Some(word) = &args.reference {
+        settings.reference = Some(frame_number("--reference", word, n)?);
+    }
+    if let Some(list) = &args.sharp {
+        settings.sharp = Some(frame_numbers("--sharp", list, n)?);
+    }
+    if let Some(list) = &args.exclude {
+        settings.exclude = frame_numbers("--exclude", list, n)?;
+    }
+    if let Some(word) = &args.alpha {
+        settings.alpha = word
+            .parse()
+            .ok()
+            .filter(|a| (0.0..=1.0).contains(a))
+            .ok_or_else(|| Usage(format!("--alpha: {word:?} is not a number from 0 to 1")))?;
+    }
+    let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
+    if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
+        return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));
+    }
+    if let Some(i) = settings.reference.filter(|i| settings.exclude.contains(i)) {
+        return Err(Usage(format!("--exclude leaves out {}, which --reference names; choose another reference", name(i))));
+    }
+    if settings.exclude.len() == n {
+        return Err(Usage(format!("--exclude leaves out all {}; keep at least one", frames::count(n, "frame"))));
+    }
+    Ok(settings)
+}
+
+/// Frame number, counted from 1, to an index.
+fn frame_number(option: &str, word: &str, frames: usize) -> Result<usize, Usage> {
+    match word.trim().parse::<usize>() {
+        Ok(n) if (1..=frames).contains(&n) => Ok(n - 1),
+        Ok(n) => Err(Usage(format!("{option}: there is no frame {n}; frames are counted from 1 to {frames}"))),
+        Err(_) => Err(Usage(format!("{option}: {word:?} is not a frame number; frames are counted from 1 to {frames}"))),
+    }
+}
+
+fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, Usage> {
+    let mut indices = Vec::new();
+    for word in list.split(',') {
+        let i = frame_number(option, word, frames)?;
+        if indices.contains(&i) {
+            return Err(Usage(format!("{option}: frame {} is named twice; name it once", i + 1)));
+        }
+        indices.push(i);
+    }
+    Ok(indices)
+}
+
+/// The three outputs, of which each can be written.
+fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Output, Option<Output>, Option<Output>)> {
+    let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
+    inputs.extend(response_file.map(|p| ("response file", p)));
+    inputs.extend(args.tsf.as_deref().map(|p| ("TSF file", p)));
+    let mut targets = vec![("--output", args.output.as_path())];
+    targets.extend(args.preview.as_deref().map(|p| ("--preview", p)));
+    targets.extend(args.report.as_deref().map(|p| ("--report", p)));
+    output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
+    let check = |p: &PathBuf| Output::check(p, args.overwrite);
+    Ok((check(&args.output)?, args.preview.as_ref().map(check).transpose()?, args.report.as_ref().map(check).transpose()?))
+}
+
+fn read_response(path: &Path) -> Result<Response, Error> {
+    if !path.exists() {
+        let reason = "is neither srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
+        return Err(Error::Format { path: path.into(), reason });
+    }
+    let text = crate::io::read_text(path)?;
+    ResponseFile::parse(&text).map(|f| f.response()).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
+}
+
+fn read_tsf(path: &Path) -> Result<TsfFile, Error> {
+    let text = crate::io::read_text(path)?;
+    TsfFile::parse(&text).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
+}
+
+/// TSF files find frames by file name: one that fits no frame, or a name that two frames share, would be used silently wrong.
+fn check_tsf_names(file: &TsfFile, path: &Path, frames: &[PathBuf]) -> Result<(), Error> {
+    let refuse = |reason| Err(Error::Format { path: path.into(), reason });
+    let names = frames::names(frames);
+    for (i, entry) in file.frames.iter().enumerate() {
+        if file.frames[..i].iter().any(|e| e.frame == entry.frame) {
+            return refuse(format!("holds two TSFs of {:?}; keep one", entry.frame));
+        }
+        let sharing = frames.iter().filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy() == entry.frame)).count();
+        if sharing > 1 {
+            return refuse(format!(
+                "holds a TSF of {:?}, a name that {sharing} frames share; give the frames different file names",
+                entry.frame
+            ));
+        }
+    }
+    if !file.frames.iter().any(|e| names.contains(&e.frame)) {
+        return refuse(format!("holds no TSF of any of the frames ({}); it names frames by file name, without folder", names.join(", ")));
+    }
+    Ok(())
+}

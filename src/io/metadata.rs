@@ -1,0 +1,37 @@
+//! What the camera noted: the exposure time in a file's EXIF data.
+
+use crate::error::{Error, Result};
+use exif::{Exif, In, Tag, Value};
+use std::io::BufReader;
+use std::path::Path;
+
+/// Exposure time Δt in seconds from the EXIF data of a JPEG, TIFF or PNG file: ExposureTime, else 2^-ShutterSpeedValue.
+/// `None` when the file holds neither (or no readable EXIF data). The value is the camera's: it can be 0.
+///
+/// # Errors
+/// [`Error::Read`] when the file cannot be opened.
+pub fn exposure_time(path: &Path) -> Result<Option<f64>> {
+    let file = std::fs::File::open(path).map_err(|e| Error::Read { path: path.into(), reason: super::plain(&e) })?;
+    let mut reader = exif::Reader::new();
+    reader.continue_on_error(true);
+    let exif = match reader.read_from_container(&mut BufReader::new(file)) {
+        Ok(exif) => exif,
+        Err(e) => match e.distill_partial_result(|_| ()) {
+            Ok(exif) => exif,
+            Err(_) => return Ok(None),
+        },
+    };
+    Ok(number(&exif, Tag::ExposureTime).or_else(|| number(&exif, Tag::ShutterSpeedValue).map(|v| (-v).exp2())))
+}
+
+/// First value of a rational field; 0/0 counts as absent.
+fn number(exif: &Exif, tag: Tag) -> Option<f64> {
+    let v = match &exif.get_field(tag, In::PRIMARY)?.value {
+        Value::Rational(v) => v.first()?.to_f64(),
+        Value::SRational(v) => v.first()?.to_f64(),
+        Value::Float(v) => f64::from(*v.first()?),
+        Value::Double(v) => *v.first()?,
+        _ => return None,
+    };
+    v.is_finite().then_some(v)
+}

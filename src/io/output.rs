@@ -1,0 +1,175 @@
+//! Results: each is written beside its target and renamed, so that a target is either whole or untouched.
+
+use super::exr::Radiometry;
+use super::plain;
+use crate::error::{Error, Result};
+use crate::image::Rgb;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use tempfile::NamedTempFile;
+
+/// A target that can be written, as far as can be told before the work begins.
+#[derive(Clone, Debug)]
+pub struct Output {
+    path: PathBuf,
+    overwrite: bool,
+}
+
+/// A result that lies complete beside its target. Dropped without [`Staged::commit`], it vanishes.
+#[derive(Debug)]
+pub struct Staged {
+    output: Output,
+    file: NamedTempFile,
+}
+
+impl Output {
+    /// Checks that `path` can be written: its folder exists and takes a file, and nothing stands there unless `overwrite`.
+    ///
+    /// # Errors
+    /// [`Error::Write`] with the remedy.
+    pub fn check(path: &Path, overwrite: bool) -> Result<Self> {
+        let output = Self { path: path.into(), overwrite };
+        if path.file_name().is_none() || path.as_os_str().to_string_lossy().ends_with(std::path::is_separator) {
+            return Err(output.refuse("is not a file name; name a file"));
+        }
+        let folder = output.folder();
+        if !folder.exists() {
+            return Err(output.refuse(&format!("the folder {} does not exist; make it first", folder.display())));
+        }
+        if !folder.is_dir() {
+            return Err(output.refuse(&format!("{} is not a folder; choose another place", folder.display())));
+        }
+        output.check_target()?;
+        output.temporary()?;
+        Ok(output)
+    }
+
+    /// The target.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Writes the whole result beside the target.
+    ///
+    /// # Errors
+    /// [`Error::Write`] with the reason that `write` gives, or the system's.
+    pub fn stage(&self, write: impl FnOnce(&mut BufWriter<&File>) -> std::result::Result<(), String>) -> Result<Staged> {
+        let file = self.temporary()?;
+        let mut buffer = BufWriter::new(file.as_file());
+        write(&mut buffer).map_err(|e| self.refuse(&e))?;
+        buffer.flush().map_err(|e| self.refuse(&plain(&e)))?;
+        drop(buffer);
+        file.as_file().sync_all().map_err(|e| self.refuse(&plain(&e)))?;
+        Ok(Staged { output: self.clone(), file })
+    }
+
+    /// Stages a linear OpenEXR image, see [`super::exr::write`].
+    ///
+    /// # Errors
+    /// [`Error::Write`], also for pixels that are NaN, infinite or negative.
+    pub fn stage_exr(&self, image: &Rgb, radiometry: &Radiometry) -> Result<Staged> {
+        self.stage(|to| super::exr::write(to, image, radiometry))
+    }
+
+    /// Stages a value as JSON text, indented, with a line end.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_json(&self, value: &impl serde::Serialize) -> Result<Staged> {
+        self.stage(|to| {
+            serde_json::to_writer_pretty(&mut *to, value).map_err(|e| e.to_string())?;
+            to.write_all(b"\n").map_err(|e| plain(&e))
+        })
+    }
+
+    /// Stages an 8-bit PNG.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_png(&self, picture: &::image::RgbImage) -> Result<Staged> {
+        self.stage(|to| {
+            let encoder = ::image::codecs::png::PngEncoder::new(to);
+            picture.write_with_encoder(encoder).map_err(|e| e.to_string())
+        })
+    }
+
+    fn folder(&self) -> &Path {
+        match self.path.parent() {
+            Some(p) if !p.as_os_str().is_empty() => p,
+            _ => Path::new("."),
+        }
+    }
+
+    /// Refuses a target that must not be replaced. Looked at twice, because a merge takes a while.
+    fn check_target(&self) -> Result<()> {
+        match std::fs::symlink_metadata(&self.path) {
+            Err(_) => Ok(()),
+            Ok(m) if m.is_dir() => Err(self.refuse("is a folder; name a file in it")),
+            Ok(_) if !self.overwrite => Err(self.refuse("exists; give --overwrite to replace it, or another name")),
+            Ok(m) if m.is_file() || m.is_symlink() => Ok(()),
+            Ok(_) => Err(self.refuse("is not a plain file; choose another name")),
+        }
+    }
+
+    /// An empty file beside the target, which vanishes when dropped, with the permissions of any new file.
+    fn temporary(&self) -> Result<NamedTempFile> {
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".unshaken-").suffix(".part");
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666)); // lessened by the umask; a temporary file's own is 600
+        builder.tempfile_in(self.folder()).map_err(|e| {
+            let said = plain(e.get_ref().and_then(|x| x.downcast_ref::<std::io::Error>()).unwrap_or(&e));
+            self.refuse(&format!("its folder takes no new file, {}; choose a folder that you may write to", before_path(&said)))
+        })
+    }
+
+    fn refuse(&self, reason: &str) -> Error {
+        Error::Write { path: self.path.clone(), reason: reason.into() }
+    }
+}
+
+/// The system's words without the name of the temporary file behind them.
+fn before_path(said: &str) -> &str {
+    said.split(" at path").next().unwrap_or(said)
+}
+
+impl Staged {
+    /// Renames the result to its target.
+    ///
+    /// # Errors
+    /// [`Error::Write`] when the target has come into being meanwhile or the system refuses.
+    pub fn commit(self) -> Result<()> {
+        self.output.check_target()?;
+        self.file.persist(&self.output.path).map_err(|e| self.output.refuse(&plain(&e.error)))?;
+        Ok(())
+    }
+}
+
+/// Checks that no two outputs are one file and that no output is an input. Each comes with the name of its option.
+///
+/// # Errors
+/// [`Error::Input`] naming both.
+pub fn check_distinct(outputs: &[(&str, &Path)], inputs: &[(&str, &Path)]) -> Result<()> {
+    for (i, (option, path)) in outputs.iter().enumerate() {
+        let same = |other: &&(&str, &Path)| is_same_file(path, other.1);
+        if let Some((other, _)) = outputs[..i].iter().find(same) {
+            return Err(Error::Input(format!("{}: both {other} and {option} would write it; give two names", path.display())));
+        }
+        if let Some((other, _)) = inputs.iter().find(same) {
+            return Err(Error::Input(format!("{}: {option} would replace the {other} that is read; give another name", path.display())));
+        }
+    }
+    Ok(())
+}
+
+/// Whether two names lead to one file, which need not exist.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    let real = |p: &Path| {
+        std::fs::canonicalize(p).ok().or_else(|| {
+            let folder = p.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            Some(std::fs::canonicalize(folder).ok()?.join(p.file_name()?))
+        })
+    };
+    a == b || matches!((real(a), real(b)), (Some(x), Some(y)) if x == y)
+}
