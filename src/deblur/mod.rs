@@ -507,10 +507,10 @@ impl<'a> Solver<'a> {
             let energy = self.scalar(SLOT_ENERGY)?;
             for i in 0..set.inner {
                 self.gpu.submit(&iteration);
-                // Waiting now and then keeps the queue short and the progress honest.
-                if i % 5 == 4 {
+                // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
+                if i % 5 == 4 || i + 1 == set.inner {
                     self.scalar(SLOT_ENERGY)?;
-                    if !progress((outer as f32 + i as f32 / set.inner as f32) / set.outer as f32) {
+                    if !progress((outer as f32 + (i + 1) as f32 / set.inner as f32) / set.outer as f32) {
                         return Err(crate::error::Error::Cancelled);
                     }
                 }
