@@ -242,7 +242,7 @@ impl<'a> Solver<'a> {
         let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).max().unwrap_or(0);
         let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).max().unwrap_or(0);
         // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let scratch = Scratch::new(gpu, wanted.min((1 << 25).max(needed)).min(gpu.max_plane()))?;
+        let scratch = Scratch::new(gpu, wanted.min((1 << 25).min(gpu.max_plane()).max(needed)))?;
         let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
         let ch = |label, count| channels(gpu, label, count);
         let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
