@@ -11,7 +11,7 @@
 //! these weights) does not rise. λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
 //! The iteration stops when an outer step lowers the objective by less than `tolerance` of it, or at `outer` steps.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
@@ -200,11 +200,28 @@ fn upload_rgb(gpu: &Gpu, label: &str, image: &Rgb) -> Result<Channels> {
     Ok([gpu.upload(label, &r.data)?, gpu.upload(label, &g.data)?, gpu.upload(label, &b.data)?])
 }
 
+/// Refuses what no upload sees: the start is clamped first, noise and exposure times travel as parameters.
+fn check(observations: &[Observation], initial: &Rgb) -> Result<()> {
+    if initial.0.iter().any(|p| p.data.iter().any(|v| !v.is_finite())) {
+        return Err(Error::Input("the start of the solver holds NaN or infinity".into()));
+    }
+    for (i, o) in observations.iter().enumerate() {
+        if !(o.exposure_time.is_finite() && o.exposure_time > 0.0) {
+            return Err(Error::Input(format!("frame {}: exposure time {} s is not a positive number", i + 1, o.exposure_time)));
+        }
+        if o.noise.iter().any(|n| n.len() != crate::kernels::NOISE_STEPS || n.iter().any(|v| !(v.is_finite() && *v > 0.0))) {
+            return Err(Error::Input(format!("frame {}: a noise curve is not {} positive numbers", i + 1, crate::kernels::NOISE_STEPS)));
+        }
+    }
+    Ok(())
+}
+
 /// Irradiance that explains `observations`, from the start `initial` (irradiance, positive; grid of the frame plus `pad` on
 /// every side). `progress` receives the fraction done; returning `false` cancels.
 ///
 /// # Errors
-/// `Cancelled`; out of memory and lost device; NaN or infinity in the input.
+/// `Cancelled`; out of memory and lost device; [`Error::Input`] for NaN or infinity in the input, exposure times and noise
+/// curves that are not positive.
 pub fn solve(
     gpu: &Gpu,
     kernels: &Kernels,
@@ -227,6 +244,7 @@ impl<'a> Solver<'a> {
         settings: &'a Settings,
     ) -> Result<Self> {
         let latent = initial.size();
+        check(observations, initial)?;
         let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
         let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
         let blurs: Vec<Option<(Blur, f32)>> = observations
@@ -242,7 +260,7 @@ impl<'a> Solver<'a> {
         let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).max().unwrap_or(0);
         let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).max().unwrap_or(0);
         // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let scratch = Scratch::new(gpu, wanted.min((1 << 25).max(needed)).min(gpu.max_plane()))?;
+        let scratch = Scratch::new(gpu, wanted.min((1 << 25).min(gpu.max_plane()).max(needed)))?;
         let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
         let ch = |label, count| channels(gpu, label, count);
         let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
@@ -507,11 +525,11 @@ impl<'a> Solver<'a> {
             let energy = self.scalar(SLOT_ENERGY)?;
             for i in 0..set.inner {
                 self.gpu.submit(&iteration);
-                // Waiting now and then keeps the queue short and the progress honest.
-                if i % 5 == 4 {
+                // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
+                if i % 5 == 4 || i + 1 == set.inner {
                     self.scalar(SLOT_ENERGY)?;
-                    if !progress((outer as f32 + i as f32 / set.inner as f32) / set.outer as f32) {
-                        return Err(crate::error::Error::Cancelled);
+                    if !progress((outer as f32 + (i + 1) as f32 / set.inner as f32) / set.outer as f32) {
+                        return Err(Error::Cancelled);
                     }
                 }
             }

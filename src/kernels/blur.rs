@@ -63,6 +63,10 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
     vec![("warp", size_of::<WarpParams>()), ("warp_adjoint", size_of::<WarpAdjointParams>()), ("tap_sum", size_of::<TapParams>())]
 }
 
+pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
+    vec![("warp", "Base", size_of::<BaseTable>()), ("warp_adjoint", "Base", size_of::<BaseTable>())]
+}
+
 /// The compiled kernels of K and Kᵀ.
 pub struct BlurKernels {
     warp: Kernel,

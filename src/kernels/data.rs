@@ -54,7 +54,7 @@ struct GaussParams {
     size: [i32; 2],
     step: [i32; 2],
     sigma: f32,
-    _pad: [f32; 3],
+    _pad: f32,
 }
 
 #[repr(C)]
@@ -148,7 +148,7 @@ impl DataKernels {
         };
         let (p, x) = (from.predicted, from.exposure);
         let gauss = |step: [i32; 2], input: &wgpu::Buffer, output: &wgpu::Buffer| {
-            self.gauss.step_2d(gpu, &GaussParams { size, step, sigma: 2.0, _pad: [0.0; 3] }, &[input, output], from.size, 1)
+            self.gauss.step_2d(gpu, &GaussParams { size, step, sigma: 2.0, _pad: 0.0 }, &[input, output], from.size, 1)
         };
         vec![
             self.misfit.step_2d(gpu, &params, &[&p[0], &p[1], &p[2], &x[0], &x[1], &x[2], from.mask, misfit], from.size, 1),

@@ -64,3 +64,8 @@ pub const SHADERS: &[(&str, &str)] = &[
 pub fn params_sizes() -> Vec<(&'static str, usize)> {
     [blur::params_sizes(), data::params_sizes(), linear::params_sizes()].concat()
 }
+
+/// Sizes of the Rust mirrors of the shaders' table entries as (shader, structure, bytes), likewise.
+pub fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
+    blur::table_sizes()
+}

@@ -1,6 +1,6 @@
 //! The program as a user runs it: outputs, messages, exit codes.
 
-use crate::support::{Noise, listing, scene, shared, write_png};
+use crate::support::files::{Noise, listing, scene, shared, write_png};
 use std::path::Path;
 use std::process::{Command, Output};
 use tempfile::{TempDir, tempdir};

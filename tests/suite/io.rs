@@ -1,6 +1,6 @@
 //! Files: frames, exposure times, OpenEXR, outputs.
 
-use crate::support::{listing, shared};
+use crate::support::files::{listing, shared};
 use image::{DynamicImage, ImageEncoder};
 use std::io::Cursor;
 use std::path::{Path, PathBuf};

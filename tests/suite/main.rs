@@ -1,7 +1,13 @@
 //! One test binary, so that wgpu is linked once.
 
+/// f64 oracles of the kernels and the solver.
+#[path = "../oracle/mod.rs"]
+mod oracle;
+/// The shared device, fixed-seed numbers, comparison, files.
 mod support;
 
+/// K, Kᵀ and the taps of a TSF.
+mod adjoint;
 /// The plain merge on frames whose irradiance is known.
 mod baseline;
 /// The program as a user runs it: outputs, messages, exit codes.
@@ -10,10 +16,18 @@ mod cli;
 mod demo;
 /// Files: frames, exposure times, OpenEXR, outputs.
 mod io;
+/// Every other kernel against its oracle.
+mod kernels;
+/// Who may import whom.
+mod layers;
 /// Quality measures against stored values of an independent implementation.
 mod metrics;
 /// Response: calibration against truth and against OpenCV, response files.
 mod response;
+/// What naga says of the shaders, without a GPU.
+mod shaders;
+/// The solver against dense algebra, and what it promises.
+mod solver;
 /// Synthetic brackets against the physics that they claim.
 mod synth;
 /// Tone mapping: degenerate images, shadows and highlights together, no halos.

@@ -1,6 +1,6 @@
 //! Response: calibration against truth and against OpenCV, response files.
 
-use crate::support::{Noise, scene, shared};
+use crate::support::files::{Noise, scene, shared};
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
 use unshaken::io::{ldr, metadata};

@@ -1,60 +1,45 @@
-//! What several modules need: shared data, small files.
+//! What tests share: the device, fixed-seed numbers, comparison.
 
-use std::path::{Path, PathBuf};
-use unshaken::image::Plane;
+pub mod files;
+pub mod gpu;
 
-/// `path` in the shared data: in the folder that UNSHAKEN_SHARED names, else in `../shared` beside the repository.
-/// Without it, `None`, and the test says that it was skipped; in CI (CI=true) the test fails.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("UNSHAKEN_SHARED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
-    let full = root.join(path);
-    if full.exists() {
-        return Some(full);
-    }
-    let missing = format!("{} is not there; set UNSHAKEN_SHARED to the folder with the shared data", full.display());
-    assert!(std::env::var("CI").as_deref() != Ok("true"), "{missing}");
-    // Past the test harness, which would swallow it in a test that passes.
-    use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "SKIPPED {}: {missing}", std::thread::current().name().unwrap_or("test"));
-    None
+/// Numbers of -1..1 from a fixed seed (splitmix64).
+pub fn noise(seed: u64, count: usize) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678;
+    let mut next = || {
+        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = state;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ (z >> 31)) >> 40
+    };
+    (0..count).map(|_| next() as f32 / (1u64 << 23) as f32 - 1.0).collect()
 }
 
-/// Names of what lies in a folder, sorted.
-pub fn listing(folder: &Path) -> Vec<String> {
-    let mut names: Vec<_> = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
+/// Numbers of `low..high` from a fixed seed.
+pub fn uniform(seed: u64, count: usize, low: f32, high: f32) -> Vec<f32> {
+    noise(seed, count).iter().map(|v| low + (high - low) * 0.5 * (v + 1.0)).collect()
 }
 
-/// An 8-bit RGB PNG of `value(x, y)` in all channels.
-pub fn write_png(path: &Path, width: u32, height: u32, value: impl Fn(u32, u32) -> u8) {
-    image::RgbImage::from_fn(width, height, |x, y| image::Rgb([value(x, y); 3])).save(path).unwrap();
+pub fn f64s(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&v| f64::from(v)).collect()
 }
 
-/// Uniform numbers in 0..1 from a fixed seed.
-pub struct Noise(rand_pcg::Pcg64Mcg);
-
-impl Noise {
-    pub fn new(seed: u128) -> Self {
-        Self(rand_pcg::Pcg64Mcg::new(seed | 1))
+/// Every entry of `got` within its own tolerance of `expected`.
+#[track_caller]
+pub fn assert_close(what: &str, got: &[f32], expected: &[f64], tolerance: impl Fn(usize) -> f64) {
+    assert_eq!(got.len(), expected.len(), "{what}: length");
+    // Written so that NaN is far from everything.
+    let close = |i: &usize| (f64::from(got[*i]) - expected[*i]).abs() <= tolerance(*i);
+    let far: Vec<_> = (0..got.len()).filter(|i| !close(i)).collect();
+    if let Some(&i) = far.first() {
+        panic!(
+            "{what}: {} of {} entries are off; entry {i} is {}, expected {} within {:e}",
+            far.len(),
+            got.len(),
+            got[i],
+            expected[i],
+            tolerance(i)
+        );
     }
-
-    pub fn uniform(&mut self) -> f64 {
-        use rand::Rng;
-        (self.0.next_u64() >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    /// Mean 0, variance 1.
-    pub fn normal(&mut self) -> f64 {
-        (-2.0 * (1.0 - self.uniform()).ln()).sqrt() * (std::f64::consts::TAU * self.uniform()).cos()
-    }
-}
-
-/// Smooth irradiance over `decades` decades below 1, with some texture, so that every shade occurs.
-pub fn scene(width: usize, height: usize, decades: f64) -> Plane {
-    Plane::from_fn(width, height, |x, y| {
-        let (u, v) = (x as f64 / width as f64, y as f64 / height as f64);
-        let t = 0.5 + 0.5 * (5.0 * u + 2.0 * (4.0 * v).sin()).cos() * (0.6 + 0.4 * (7.0 * v + 3.0 * u).sin());
-        10f64.powf(decades * (t - 1.0)) as f32
-    })
 }

@@ -1,0 +1,332 @@
+//! K and Kᵀ entry by entry against explicit matrix rows, and the taps of a TSF against its poses.
+
+use crate::oracle::blur::{self, Matrix};
+use crate::support::gpu::{POISON, buffer, gpu, kernels, planes, poisoned, read, run};
+use crate::support::{assert_close, f64s, noise};
+use glam::{DMat3, DVec2};
+use unshaken::kernels::{Blur, Channels, Scratch};
+use unshaken::pose::Pose;
+use unshaken::tsf::{Interpolation, TapSet, Tsf};
+
+const ALL: [Interpolation; 3] = [Interpolation::Bilinear, Interpolation::Bicubic, Interpolation::SixPoint];
+const SIZES: [(usize, usize); 7] = [(1, 1), (1, 7), (7, 1), (17, 9), (33, 65), (67, 31), (300, 5)];
+
+/// Inputs with more behind their end: what a missing check of the border would read.
+fn with_more(values: &[Vec<f32>; 3]) -> Channels {
+    planes(&values.each_ref().map(|v| [v.as_slice(), &[POISON; 400]].concat()))
+}
+
+fn turned(t: (f64, f64), theta_deg: (f64, f64, f64), weight: f64) -> Pose {
+    let planar = Pose::planar(t.0, t.1, theta_deg.2, weight);
+    Pose { theta_x_deg: theta_deg.0, theta_y_deg: theta_deg.1, ..planar }
+}
+
+/// TSFs by name for a frame of `width` pixels: what a hand does, and what it hardly does.
+fn motions(width: usize) -> Vec<(&'static str, Tsf)> {
+    let focal = 1.3 * width.max(20) as f64;
+    let make = |poses: Vec<Pose>| Tsf::new(focal, poses).expect("valid poses");
+    let planar = |p: &[(f64, f64, f64, f64)]| make(p.iter().map(|p| Pose::planar(p.0, p.1, p.2, p.3)).collect());
+    vec![
+        ("integer shift", planar(&[(3.0, -2.0, 0.0, 1.0)])),
+        ("fractional shifts", planar(&[(0.37, -1.61, 0.0, 0.5), (1.93, 0.25, 0.0, 0.3), (-2.5, 4.75, 0.0, 0.2)])),
+        ("rotations", planar(&[(0.4, -0.3, -0.7, 0.3), (1.2, 0.8, 0.1, 0.5), (-2.6, 1.1, 0.9, 0.2)])),
+        // A row sum of the Jacobian of cos 21° + sin 21° = 1.29: targets lie farther apart than the support.
+        ("large rotation", planar(&[(0.3, 0.6, 21.0, 1.0)])),
+        ("pitch and yaw", make(vec![turned((0.2, -0.9), (0.4, -0.8, 0.3), 0.6), turned((-1.3, 0.5), (-1.1, 0.9, -0.5), 0.4)])),
+        ("strong perspective", make(vec![turned((0.4, 0.7), (6.0, -11.0, 4.0), 1.0)])),
+        ("extreme perspective", make(vec![turned((0.4, 0.7), (-14.0, 24.0, 8.0), 1.0)])),
+        ("partly beyond the frame", planar(&[(0.6 * width as f64, 2.3, 0.4, 0.5), (0.2, -3.4, 0.0, 0.5)])),
+        ("wholly beyond the frame", planar(&[(2.0 * width as f64 + 40.5, 90.25, 0.0, 1.0)])),
+    ]
+}
+
+/// Bound of the f32 error of one entry of K x or Kᵀ y for inputs within ±1.
+///
+/// The displacement H⁻¹q - q carries 5 roundings (coefficient, product, sum, perspective sum, division) of its size D; an
+/// interpolation's weights sum to at most 1.5 in absolute value per axis and their slopes to at most 4, so a position error
+/// δ on both axes moves a value by 2 · 4 · 1.5 δ. The sums of 4 S² and of all taps round once per term, at most.
+fn tolerance(taps: &TapSet, frame: (usize, usize), support: usize) -> f64 {
+    let half_ulp = 2f64.powi(-24);
+    let reach = taps.taps.iter().map(|t| t.dx.abs().max(t.dy.abs())).max().unwrap_or(0) as f64;
+    let corner = DVec2::new(frame.0 as f64, frame.1 as f64) / 2.0 + reach;
+    let mut displacement = 1.0f64;
+    for h in &taps.bases {
+        for s in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+            let q = corner * DVec2::new(s.0, s.1);
+            displacement = displacement.max((blur::transform(&h.inverse(), q) - q).abs().max_element());
+        }
+    }
+    let total: f64 = taps.taps.iter().map(|t| t.weight.abs()).sum();
+    total * half_ulp * (12.0 * 5.0 * displacement + (4 * support * support + taps.taps.len()) as f64)
+}
+
+struct Case {
+    name: String,
+    frame: (usize, usize),
+    pad: usize,
+    interpolation: Interpolation,
+    matrix: Matrix,
+    blur: Blur,
+    tolerance: f64,
+}
+
+impl Case {
+    fn new(name: &str, tsf: &Tsf, frame: (usize, usize), pad: usize, interpolation: Interpolation) -> Self {
+        let taps = TapSet::new(tsf, frame.0, frame.1, interpolation);
+        Self {
+            name: format!("{name}, {} x {} pixels, pad {pad}, {interpolation:?}", frame.0, frame.1),
+            frame,
+            pad,
+            interpolation,
+            matrix: blur::of_taps(&taps, interpolation, frame, pad),
+            blur: Blur::new(gpu(), &kernels(interpolation).blur, &taps, frame, pad),
+            tolerance: tolerance(&taps, frame, interpolation.support()),
+        }
+    }
+
+    fn counts(&self) -> (usize, usize) {
+        ((self.frame.0 + 2 * self.pad) * (self.frame.1 + 2 * self.pad), self.frame.0 * self.frame.1)
+    }
+
+    fn scratch(&self, capacity: usize) -> Scratch {
+        Scratch::new(gpu(), capacity).expect("fits")
+    }
+
+    fn forward(&self, scratch: &Scratch, latent: &Channels) -> [Vec<f32>; 3] {
+        let m = self.counts().1;
+        let out = [poisoned(m), poisoned(m), poisoned(m)];
+        run(&self.blur.forward(gpu(), &kernels(self.interpolation).blur, scratch, latent, &out));
+        out.map(|o| read(&o, m))
+    }
+
+    /// `start + factor Kᵀ frame`.
+    fn adjoint(&self, scratch: &Scratch, frame: &Channels, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
+        let out = planes(start);
+        run(&self.blur.adjoint(gpu(), &kernels(self.interpolation).blur, scratch, frame, &out, factor));
+        out.map(|o| read(&o, self.counts().0))
+    }
+
+    /// Both operators on noise, and columns of both.
+    fn check(&self, scratch: &Scratch) {
+        let (n, m) = self.counts();
+        let latent = [noise(1, n), noise(2, n), noise(3, n)];
+        for (c, got) in self.forward(scratch, &with_more(&latent)).iter().enumerate() {
+            let expected = self.matrix.apply(&f64s(&latent[c]));
+            assert_close(&format!("K, channel {c}, {}", self.name), got, &expected, |_| self.tolerance);
+        }
+        let frame = [noise(4, m), noise(5, m), noise(6, m)];
+        let (start, factor) = ([noise(7, n), noise(8, n), noise(9, n)], 0.75f32);
+        for (c, got) in self.adjoint(scratch, &with_more(&frame), &start, factor).iter().enumerate() {
+            let back = self.matrix.transposed(&f64s(&frame[c]));
+            let expected: Vec<f64> = start[c].iter().zip(&back).map(|(&s, b)| f64::from(s) + f64::from(factor) * b).collect();
+            // A source pixel may have somewhat more targets than a target has sources.
+            assert_close(&format!("Kᵀ, channel {c}, {}", self.name), got, &expected, |_| 2.0 * self.tolerance + 2e-7);
+        }
+        // Columns: three unit vectors at once, one per channel.
+        let unit = |i: usize, count: usize| (0..count).map(|k| if k == i { 1.0 } else { 0.0 }).collect::<Vec<f32>>();
+        let (w, h) = self.frame;
+        for pixels in [[0, w - 1, m - w], [m - 1, (h / 2) * w + w / 2, (h / 3) * w + w / 4]] {
+            let units = pixels.map(|i| unit(i, m));
+            let zero = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+            for (c, got) in self.adjoint(scratch, &with_more(&units), &zero, 1.0).iter().enumerate() {
+                let expected = self.matrix.transposed(&f64s(&units[c]));
+                assert_close(&format!("row {} of K by Kᵀ, {}", pixels[c], self.name), got, &expected, |_| self.tolerance);
+            }
+        }
+        let middle = (h / 2 + self.pad) * (w + 2 * self.pad) + w / 2 + self.pad;
+        let units = [0, middle, n - 1].map(|i| unit(i, n));
+        for (c, got) in self.forward(scratch, &with_more(&units)).iter().enumerate() {
+            let expected = self.matrix.apply(&f64s(&units[c]));
+            assert_close(&format!("column of K, channel {c}, {}", self.name), got, &expected, |_| self.tolerance);
+        }
+    }
+}
+
+fn check_all(interpolation: Interpolation) {
+    for frame in SIZES {
+        for (name, tsf) in motions(frame.0) {
+            for pad in [0, 5] {
+                let case = Case::new(name, &tsf, frame, pad, interpolation);
+                // One value more than the operator asks for: what lies beyond must not be read.
+                case.check(&case.scratch(case.blur.scratch_wanted() + 1));
+            }
+        }
+    }
+}
+
+#[test]
+fn bilinear_blur_and_adjoint_equal_the_matrix() {
+    check_all(Interpolation::Bilinear);
+}
+
+#[test]
+fn bicubic_blur_and_adjoint_equal_the_matrix() {
+    check_all(Interpolation::Bicubic);
+}
+
+#[test]
+fn six_point_blur_and_adjoint_equal_the_matrix() {
+    check_all(Interpolation::SixPoint);
+}
+
+#[test]
+fn a_frame_six_thousand_pixels_wide_keeps_its_precision() {
+    let poses = vec![Pose::planar(0.3, -0.2, 0.15, 0.6), Pose::planar(2.8, 0.4, 0.16, 0.4)];
+    let case = Case::new("wide", &Tsf::new(7000.0, poses).expect("valid"), (6001, 3), 12, Interpolation::Bicubic);
+    case.check(&case.scratch(case.blur.scratch_wanted()));
+}
+
+#[test]
+fn several_passes_equal_one() {
+    for (name, tsf) in motions(33).into_iter().filter(|m| ["rotations", "pitch and yaw", "partly beyond the frame"].contains(&m.0)) {
+        let case = Case::new(name, &tsf, (33, 21), 4, Interpolation::Bicubic);
+        let one = case.blur.scratch_needed();
+        assert!(case.blur.scratch_wanted() > one, "{name}: more than one base warp");
+        for capacity in [one, one + 1, 2 * one, case.blur.scratch_wanted() - 1] {
+            case.check(&case.scratch(capacity));
+        }
+    }
+}
+
+#[test]
+fn scratch_is_shared_without_traces() {
+    let scratch = Scratch::new(gpu(), 40 * 60 * 90).expect("fits");
+    for round in 0..2 {
+        for (name, tsf) in motions(33).iter().take(7) {
+            let case = Case::new(&format!("round {round}, {name}"), tsf, (33, 21), 4, Interpolation::Bicubic);
+            let loud = [1.0f32, 2.0, 3.0].map(|v| vec![v * POISON; case.counts().0]);
+            case.forward(&scratch, &with_more(&loud));
+            case.check(&scratch);
+        }
+    }
+}
+
+#[test]
+fn interpolations_reproduce_polynomials() {
+    for (interpolation, degree) in ALL.into_iter().zip([1, 2, 3]) {
+        for step in 0..40 {
+            let f = f64::from(step) / 40.0;
+            for n in 0..=degree {
+                let sum: f64 = (-4..=4).map(|k| blur::weight(interpolation, f64::from(k) - f) * f64::from(k).powi(n)).sum();
+                assert!((sum - f.powi(n)).abs() < 1e-12, "{interpolation:?} of x^{n} at {f}: {sum}");
+            }
+        }
+        for x in noise(11, 500).iter().map(|&v| 4.0 * f64::from(v)) {
+            let (w, e) = (interpolation.weight(x), 1e-6);
+            assert!((w - blur::weight(interpolation, x)).abs() < 1e-14, "{interpolation:?} at {x}");
+            let slope = (blur::weight(interpolation, x + e) - blur::weight(interpolation, x - e)) / (2.0 * e);
+            assert!((interpolation.slope(x) - slope).abs() < 1e-5, "{interpolation:?}: slope at {x}");
+        }
+    }
+}
+
+/// Poses of a TSF as (homography, weight), composed here and not by `Pose`: T K exp([θ]×) K⁻¹, the exponential by its series.
+fn homographies(tsf: &Tsf) -> Vec<(DMat3, f64)> {
+    tsf.poses
+        .iter()
+        .map(|p| {
+            let (x, y, z) = (p.theta_x_deg.to_radians(), p.theta_y_deg.to_radians(), p.theta_z_deg.to_radians());
+            let phi = DMat3::from_cols_array(&[0.0, z, -y, -z, 0.0, x, y, -x, 0.0]);
+            let (mut rotation, mut term) = (DMat3::IDENTITY, DMat3::IDENTITY);
+            for n in 1..20 {
+                term = term * phi * (1.0 / f64::from(n));
+                rotation += term;
+            }
+            let f = tsf.focal_px;
+            let k = DMat3::from_cols_array(&[f, 0.0, 0.0, 0.0, f, 0.0, 0.0, 0.0, 1.0]);
+            let shift = DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, p.t_x, p.t_y, 1.0]);
+            (shift * k * rotation * k.inverse(), p.weight)
+        })
+        .collect()
+}
+
+#[test]
+fn translations_become_taps_without_loss() {
+    for interpolation in ALL {
+        for (name, tsf) in motions(17).into_iter().filter(|m| ["integer shift", "fractional shifts"].contains(&m.0)) {
+            let taps = TapSet::new(&tsf, 17, 9, interpolation);
+            assert_eq!(taps.bases.len(), 1, "{name}");
+            let (got, expected) =
+                (blur::of_taps(&taps, interpolation, (17, 9), 8), blur::of_poses(&homographies(&tsf), interpolation, (17, 9), 8));
+            let latent = f64s(&noise(21, got.columns));
+            // Taps below 5e-4 of the largest are dropped, at most 4 S² per pose, and the others scaled back to sum 1.
+            let largest = taps.taps.iter().fold(0.0f64, |a, t| a.max(t.weight.abs()));
+            let bound = 2.0 * 5e-4 * largest * (4 * interpolation.support().pow(2) * tsf.poses.len()) as f64;
+            for (a, b) in got.apply(&latent).iter().zip(expected.apply(&latent)) {
+                assert!((a - b).abs() <= bound, "{name}, {interpolation:?}: {a} {b}");
+            }
+        }
+    }
+}
+
+#[test]
+fn taps_see_what_the_poses_see() {
+    // An image whose wavelengths are long (16 to 30 px), so that interpolation costs little and misplaced pixels much.
+    let waves = [(0.38, 0.11, 0.3), (-0.17, 0.29, 1.1), (0.05, -0.35, 2.0)];
+    let image = |p: DVec2| waves.iter().map(|w: &(f64, f64, f64)| (w.0 * p.x + w.1 * p.y + w.2).sin() / 3.0).sum::<f64>();
+    let gradient = waves.iter().map(|w| w.0.hypot(w.1) / 3.0).sum::<f64>();
+    let curvature = waves.iter().map(|w| (w.0 * w.0 + w.1 * w.1) / 3.0).sum::<f64>();
+    let (frame, pad) = ((61usize, 47usize), 16usize);
+    let centre = DVec2::new(30.0, 23.0);
+    for (name, tsf) in motions(frame.0).into_iter().filter(|m| !m.0.contains("beyond") && m.0 != "extreme perspective") {
+        let poses = homographies(&tsf);
+        for (pose, (h, _)) in tsf.poses.iter().zip(&poses) {
+            let p = DVec2::new(-20.0, 13.0);
+            assert!((pose.apply(tsf.focal_px, p) - blur::transform(h, p)).length() < 1e-9, "{name}: {pose:?}");
+        }
+        let taps = TapSet::new(&tsf, frame.0, frame.1, Interpolation::SixPoint);
+        let matrix = blur::of_taps(&taps, Interpolation::SixPoint, frame, pad);
+        let width = frame.0 + 2 * pad;
+        let at = |i: usize| DVec2::new((i % width) as f64, (i / width) as f64) - DVec2::splat(pad as f64) - centre;
+        let latent: Vec<f64> = (0..matrix.columns).map(|i| image(at(i))).collect();
+        let ones = matrix.apply(&vec![1.0; matrix.columns]);
+        // Rolls are split between angles 1/2 px apart at the corner: half of f'' (1/4)² at most. Poses with pitch and yaw
+        // share a base within 1/4 px. Two interpolations of fourth order: below 1e-3 at these wavelengths; dropped taps too.
+        let flat = tsf.poses.iter().all(|p| p.theta_x_deg == 0.0 && p.theta_y_deg == 0.0);
+        let shared = !flat && taps.bases.len() < tsf.poses.len();
+        let bound = if shared { 0.25 * gradient } else { 0.5 * 0.0625 * curvature } + 3e-3;
+        let mut interior = 0;
+        for (i, got) in matrix.apply(&latent).iter().enumerate() {
+            if (ones[i] - 1.0).abs() < 1e-9 {
+                let q = DVec2::new((i % frame.0) as f64, (i / frame.0) as f64) - centre;
+                let expected: f64 = poses.iter().map(|(h, w)| w * image(blur::transform(&h.inverse(), q))).sum();
+                assert!((got - expected).abs() <= bound, "{name} at {q}: {got}, expected {expected} within {bound}");
+                interior += 1;
+            }
+        }
+        assert!(interior > frame.0 * frame.1 / 2, "{name}: only {interior} pixels see inside");
+    }
+}
+
+#[test]
+fn nearby_poses_with_pitch_and_yaw_share_a_base() {
+    let poses = (0..8).map(|i| turned((0.0, 0.0), (0.02 * f64::from(i), 0.3 - 0.05 * f64::from(i), 0.0), 0.125)).collect();
+    let tsf = Tsf::new(80.0, poses).expect("valid");
+    let taps = TapSet::new(&tsf, 61, 47, Interpolation::Bicubic);
+    assert!(taps.bases.len() < 8, "{} bases", taps.bases.len());
+    let total: f64 = taps.taps.iter().map(|t| t.weight).sum();
+    assert!((total - 1.0).abs() < 1e-12);
+    // The centre's PSF must lie where the poses put the centre, on average.
+    let mean = taps.taps.iter().fold(DVec2::ZERO, |a, t| {
+        let base = blur::transform(&taps.bases[t.base], DVec2::ZERO);
+        a + t.weight * (base + DVec2::new(f64::from(t.dx), f64::from(t.dy)))
+    });
+    let expected = homographies(&tsf).iter().fold(DVec2::ZERO, |a, (h, w)| a + *w * blur::transform(h, DVec2::ZERO));
+    assert!((mean - expected).length() < 0.05, "{mean} {expected}");
+}
+
+#[test]
+fn energy_is_the_sum_of_squares_of_the_psf() {
+    let two = Tsf::new(500.0, vec![Pose::planar(0.0, 0.0, 0.0, 0.75), Pose::planar(4.0, 1.0, 0.0, 0.25)]).expect("valid");
+    let energy = TapSet::new(&two, 17, 9, Interpolation::Bicubic).energy();
+    assert!((energy - (0.75 * 0.75 + 0.25 * 0.25)).abs() < 1e-12, "{energy}");
+}
+
+#[test]
+fn nan_and_infinity_are_refused() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let error = gpu().upload("plane", &[0.0, bad]).expect_err("must be refused").to_string();
+        assert!(error.contains("plane") && error.contains("value 1"), "{error}");
+    }
+    assert_eq!(read(&buffer(&[1.5]), 1), [1.5]);
+}

@@ -1,0 +1,232 @@
+//! Who may import whom: the `crate::` paths of the sources against a table.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+/// Module: what it may name of the crate, as `module` or, where only some items may pass, `module::Item`.
+const TABLE: &[(&str, &[&str])] = &[
+    // What everything else speaks of.
+    ("error", &[]),
+    ("image", &["error"]),
+    ("pose", &[]),
+    ("exposure", &["error", "image"]),
+    // Mathematics without images.
+    ("fft", &[]),
+    ("nonnegative", &[]),
+    // The stages before the solver: none knows a GPU.
+    ("response", &["error", "image", "exposure"]),
+    ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
+    ("mask", &["error", "image", "exposure"]),
+    ("merge", &["error", "image", "exposure", "mask", "noise", "kernels::NOISE_STEPS"]),
+    ("baseline", &["error", "image", "exposure", "response", "mask", "noise"]),
+    ("register", &["error", "image", "pose", "exposure", "noise", "mask"]),
+    ("triage", &["error", "image", "exposure", "noise", "mask"]),
+    ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
+    ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
+    // The device, its operators, the solver.
+    ("gpu", &["error"]),
+    ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet"]),
+    ("deblur", &["error", "image", "pose", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
+    // All stages in order. Of the kernels it only opens the set.
+    (
+        "pipeline",
+        &[
+            "error",
+            "image",
+            "pose",
+            "exposure",
+            "response",
+            "noise",
+            "mask",
+            "merge",
+            "register",
+            "triage",
+            "psf",
+            "tsf",
+            "gpu",
+            "deblur",
+            "kernels::Kernels",
+        ],
+    ),
+    // Brackets with known truth: never an estimator.
+    ("synth", &["error", "image", "pose", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    // Judges and pictures.
+    ("metrics", &["error", "image"]),
+    ("tonemap", &["error", "image"]),
+    // The edges of the program.
+    ("io", &["error", "image", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    (
+        "cli",
+        &[
+            "error",
+            "image",
+            "exposure",
+            "response",
+            "baseline",
+            "io",
+            "pipeline",
+            "metrics",
+            "tonemap",
+            "synth",
+            "gpu::list_adapters",
+            "tsf::Tsf",
+            "tsf::TsfEntry",
+            "tsf::TsfFile",
+        ],
+    ),
+    ("lib", &[]),
+    ("main", &["cli"]),
+];
+
+/// The code of a source: no comments, no strings' contents that matter, one line.
+fn code(source: &str) -> String {
+    let lines = source.lines().map(|l| l.split("//").next().unwrap_or_default());
+    lines.collect::<Vec<_>>().join(" ").split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Every path after `prefix` (`crate::`) as `module` or `module::item`; braces are opened.
+fn paths(source: &str, prefix: &str) -> BTreeSet<String> {
+    let code = code(source);
+    let mut found = BTreeSet::new();
+    for (at, _) in code.match_indices(prefix) {
+        if code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_') {
+            continue;
+        }
+        for tree in branches(&code[at + prefix.len()..]) {
+            let (module, rest) = tree.split_once("::").unwrap_or((&tree, ""));
+            let items = if rest.is_empty() { vec![String::new()] } else { branches(rest) };
+            for item in items {
+                let item = item.split("::").next().unwrap_or_default();
+                let item = item.split(" as ").next().unwrap_or_default();
+                let whole = item.is_empty() || item == "self";
+                found.insert(if whole { module.to_string() } else { format!("{module}::{item}") });
+            }
+        }
+    }
+    found
+}
+
+/// The paths at the head of `text`: one, or those between its braces.
+fn branches(text: &str) -> Vec<String> {
+    let Some(inner) = text.strip_prefix('{') else {
+        // One path, up to the first character that no path holds, with the group of braces that may end it.
+        let end = text.find(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':' || c == '*')).unwrap_or(text.len());
+        let group = if text[..end].ends_with("::") && text[end..].starts_with('{') { closing(&text[end..]) } else { 0 };
+        return vec![text[..end + group].trim_end_matches(':').to_string()];
+    };
+    let (mut depth, mut parts) = (0, vec![String::new()]);
+    for c in inner[..closing(text) - 2].chars() {
+        match c {
+            '{' => depth += 1,
+            '}' => depth -= 1,
+            ',' if depth == 0 => {
+                parts.push(String::new());
+                continue;
+            }
+            _ => {}
+        }
+        parts.last_mut().expect("never empty").push(c);
+    }
+    parts.iter().map(|p| p.trim().to_string()).filter(|p| !p.is_empty()).collect()
+}
+
+/// Bytes up to and with the brace that closes the one `text` begins with.
+fn closing(text: &str) -> usize {
+    let mut depth = 0;
+    for (i, c) in text.char_indices() {
+        depth += match c {
+            '{' => 1,
+            '}' => -1,
+            _ => 0,
+        };
+        if depth == 0 {
+            return i + 1;
+        }
+    }
+    text.len()
+}
+
+/// What `sources` (module, text) import against `table`, one line each.
+fn violations(sources: &[(String, String)], table: &[(&str, &[&str])]) -> Vec<String> {
+    let table: BTreeMap<_, _> = table.iter().copied().collect();
+    let mut found = Vec::new();
+    for (module, text) in sources {
+        let Some(allowed) = table.get(module.as_str()) else {
+            found.push(format!("{module} has no line in the table of layers"));
+            continue;
+        };
+        // The binary names the library by its name.
+        for path in paths(text, "crate::").union(&paths(text, "unshaken::")) {
+            let other = path.split("::").next().unwrap_or_default();
+            if other != module && !allowed.contains(&other) && !allowed.contains(&path.as_str()) {
+                found.push(format!("{module} may not import {path}"));
+            }
+        }
+    }
+    found
+}
+
+/// All sources below `folder` with the module that each belongs to.
+fn sources(folder: &Path, module: Option<&str>, into: &mut Vec<(String, String)>) {
+    for entry in std::fs::read_dir(folder).expect("the sources") {
+        let path = entry.expect("readable").path();
+        let stem = path.file_stem().expect("a name").to_str().expect("ASCII").to_string();
+        let module = module.unwrap_or(&stem);
+        if path.is_dir() {
+            sources(&path, Some(module), into);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            into.push((module.to_string(), std::fs::read_to_string(&path).expect("text")));
+        }
+    }
+}
+
+#[test]
+fn modules_import_what_their_layer_allows() {
+    let mut all = Vec::new();
+    sources(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/src")), None, &mut all);
+    assert!(all.len() > 15, "only {} sources found", all.len());
+    let found = violations(&all, TABLE);
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn a_wrong_import_is_found_however_it_is_written() {
+    let check = |module: &str, text: &str| violations(&[(module.into(), text.into())], TABLE);
+    for (module, text) in [
+        ("synth", "use crate::deblur::solve;"),
+        ("synth", "use crate::tsf::estimate;"),
+        ("synth", "use crate::{image::Rgb, triage};"),
+        ("gpu", "use crate::{\n    error::Error,\n    image::{Plane, Rgb},\n};"),
+        ("gpu", "fn f() { crate::kernels::channels(); }"),
+        ("kernels", "use crate::tsf::{Interpolation, Tsf};"),
+        ("kernels", "pub use crate::deblur;"),
+        ("pipeline", "use crate::kernels::{Kernels, Blur};"),
+        ("pipeline", "use crate::kernels::*;"),
+        ("cli", "use crate::kernels;"),
+        ("error", "use crate::image::Plane as P;"),
+        ("main", "use unshaken::gpu::Gpu;"),
+        ("helpers", ""),
+    ] {
+        assert!(!check(module, text).is_empty(), "{module}: {text}");
+    }
+    for (module, text) in [
+        ("gpu", "// use crate::image;\n/// [`crate::deblur::solve`]\nuse crate::error::{Error, Result};"),
+        ("kernels", "use crate::tsf::{Interpolation, Tap, TapSet};\nuse crate::gpu::{self, Gpu};"),
+        ("synth", "use crate::{error::Result, tsf::{Tsf, TsfFile}, synth::scene};"),
+        ("pipeline", "let k = crate::kernels::Kernels::new(gpu, i);"),
+        ("main", "fn main() { unshaken::cli::main() }"),
+    ] {
+        assert_eq!(check(module, text), Vec::<String>::new(), "{module}: {text}");
+    }
+}
+
+#[test]
+fn the_oracles_know_nothing_of_the_kernels() {
+    let mut all = Vec::new();
+    sources(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/oracle")), Some("oracle"), &mut all);
+    assert!(all.len() >= 4);
+    for (_, text) in all {
+        let imports = paths(&text, "unshaken::");
+        assert!(!imports.iter().any(|p| ["kernels", "deblur", "gpu"].contains(&p.split("::").next().unwrap_or_default())), "{imports:?}");
+    }
+}

@@ -1,0 +1,45 @@
+//! One device for the whole test binary. Without an adapter the tests fail: none is skipped.
+
+use std::sync::OnceLock;
+use unshaken::gpu::{self, Gpu, Step};
+use unshaken::kernels::{Channels, Kernels};
+use unshaken::tsf::Interpolation;
+
+/// What every output buffer holds before a kernel that overwrites it.
+pub const POISON: f32 = -12345.0;
+
+/// The device.
+pub fn gpu() -> &'static Gpu {
+    static GPU: OnceLock<Gpu> = OnceLock::new();
+    GPU.get_or_init(|| Gpu::new().unwrap_or_else(|e| panic!("the tests need a GPU adapter: {e}")))
+}
+
+/// The kernels of one interpolation.
+pub fn kernels(interpolation: Interpolation) -> &'static Kernels {
+    static KERNELS: [OnceLock<Kernels>; 3] = [const { OnceLock::new() }; 3];
+    KERNELS[interpolation.support() - 1].get_or_init(|| Kernels::new(gpu(), interpolation))
+}
+
+/// A buffer that holds `values`.
+pub fn buffer(values: &[f32]) -> wgpu::Buffer {
+    gpu().upload("test", values).expect("finite values that fit")
+}
+
+/// Three buffers.
+pub fn planes(values: &[Vec<f32>; 3]) -> Channels {
+    values.each_ref().map(|v| buffer(v))
+}
+
+/// A buffer of `count` values that a kernel has to overwrite.
+pub fn poisoned(count: usize) -> wgpu::Buffer {
+    buffer(&vec![POISON; count])
+}
+
+pub fn run(steps: &[Step]) {
+    gpu().submit(steps);
+}
+
+/// The first `count` values of a buffer.
+pub fn read(buffer: &wgpu::Buffer, count: usize) -> Vec<f32> {
+    gpu::read(gpu(), buffer, count).expect("the device answers")
+}
