@@ -65,9 +65,9 @@ pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
 /// Side of the blocks whose variance is measured, pixels.
 const BLOCK: usize = 8;
 /// Quantile of the blocks' variances that is taken for noise alone: texture only ever adds.
-const QUANTILE: f64 = 0.15;
+const QUANTILE: f64 = 0.05;
 /// That quantile of the mean square of 64 samples of filtered white noise over its expectation (2·10⁴ simulated blocks).
-const QUANTILE_OF_NOISE: f64 = 0.681;
+const QUANTILE_OF_NOISE: f64 = 0.554;
 
 /// Noise level of a bracket's frames, from the high-pass variance of their flattest blocks at each exposure.
 ///
@@ -132,38 +132,43 @@ fn collect_blocks(z: &Plane, x: &Plane, quantum: &impl Fn(f64) -> f64, blocks: &
     }
 }
 
-/// Weighted least squares of variance = shot · x + read with both at least 0; samples far above the fit (texture) lose weight.
+/// Share of the samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.
+const BELOW: f64 = 0.15;
+
+/// Quantile regression of variance = shot · x + read in logarithms, by search over both parameters, each step finer.
 fn fit(samples: &[(f64, f64, f64)]) -> Option<NoiseModel> {
     if samples.is_empty() {
         return None;
     }
-    let mut weights: Vec<f64> = samples.iter().map(|s| s.2 / (s.1 * s.1)).collect();
-    let mut model = NoiseModel { shot: 0.0, read: 0.0 };
-    for _ in 0..10 {
-        let (mut sw, mut sx, mut sxx, mut sv, mut sxv) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for (s, w) in samples.iter().zip(&weights) {
-            sw += w;
-            sx += w * s.0;
-            sxx += w * s.0 * s.0;
-            sv += w * s.1;
-            sxv += w * s.0 * s.1;
+    let loss = |shot: f64, read: f64| -> f64 {
+        samples
+            .iter()
+            .map(|&(x, v, n)| {
+                let r = (v / (shot * x + read)).ln();
+                n * if r > 0.0 { BELOW * r } else { (BELOW - 1.0) * r }
+            })
+            .sum()
+    };
+    // Full wells of 100 to 10⁷ e⁻; read noise from that of a perfect sensor to a tenth of white.
+    let (mut shot, mut read) = ((1e-7f64.ln(), 1e-2f64.ln()), (1e-10f64.ln(), 1e-2f64.ln()));
+    let mut best = (f64::INFINITY, 0.0, 0.0);
+    for _ in 0..4 {
+        const STEPS: usize = 48;
+        let at = |range: (f64, f64), i: usize| range.0 + (range.1 - range.0) * i as f64 / STEPS as f64;
+        for i in 0..=STEPS {
+            for j in 0..=STEPS {
+                let (a, b) = (at(shot, i), at(read, j));
+                let l = loss(a.exp(), b.exp());
+                if l < best.0 {
+                    best = (l, a, b);
+                }
+            }
         }
-        let det = sw * sxx - sx * sx;
-        let (mut shot, mut read) =
-            if det > 1e-12 * sw * sxx { ((sw * sxv - sx * sv) / det, (sxx * sv - sx * sxv) / det) } else { (0.0, sv / sw) };
-        if read < 0.0 {
-            (shot, read) = (sxv / sxx, 0.0);
-        }
-        if shot < 0.0 {
-            (shot, read) = (0.0, sv / sw);
-        }
-        model = NoiseModel { shot, read };
-        for (s, w) in samples.iter().zip(&mut weights) {
-            let expected = model.variance(s.0).max(1e-12);
-            let excess = (s.1 / expected - 1.0).max(0.0);
-            *w = s.2 / (expected * expected) / (1.0 + 25.0 * excess * excess);
-        }
+        let around = |range: (f64, f64), c: f64| {
+            let half = 3.0 * (range.1 - range.0) / STEPS as f64;
+            (c - half, c + half)
+        };
+        (shot, read) = (around(shot, best.1), around(read, best.2));
     }
-    // A noiseless file still has rounding; a floor keeps the weights finite.
-    Some(NoiseModel { shot: model.shot.max(1e-7), read: model.read.max(1e-10) })
+    Some(NoiseModel { shot: best.1.exp(), read: best.2.exp() })
 }

@@ -285,13 +285,15 @@ impl Run<'_> {
         let latent = latent.mean();
         let (w, h) = latent.size();
         let (blurred, weight) = self.luminance(i, &latent);
+        let clock = Instant::now();
         let patches = psf::choose(&latent, &weight, PATCH_SIZE.min(w / 2).min(h / 2).max(16), PATCHES);
         let psfs: Vec<(psf::Patch, psf::Psf)> =
             patches.iter().filter_map(|p| Some((*p, psf::estimate(&latent, 0, &blurred, &weight, p, GRID_RADIUS)?))).collect();
         let grid = PoseGrid::new(w, h, GRID_RADIUS, GRID_DEGREES, 1.0);
         let from_psfs = tsf::from_psfs(&psfs, &grid, w, h);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
-        let tsf = frame.fit_grid(&grid, from_psfs.as_ref()).map(|t| frame.refine(&t, self.settings.deblur.interpolation));
+        let tsf = frame.fit_grid(&grid, from_psfs.as_ref());
+        let tsf = tsf.map(|t| frame.refine(&t, self.settings.deblur.interpolation));
         let detail = json!({
             "patches": psfs.iter().map(|(p, h)| json!({
                 "x": p.x, "y": p.y, "size": p.size, "score": p.score,

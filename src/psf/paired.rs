@@ -2,7 +2,7 @@
 
 use super::{Patch, Psf};
 use crate::image::Plane;
-use crate::nonnegative::coordinate_descent;
+use crate::nonnegative::{coordinate_descent, gram};
 use nalgebra::DMatrix;
 
 /// Rows of the least-squares system at most: the differences with most noise-weighted structure.
@@ -52,7 +52,7 @@ pub fn estimate(latent: &Plane, pad: usize, blurred: &Plane, weight: &Plane, pat
             }
         }
     }
-    let gram: Vec<f64> = a.tr_mul(&a).iter().map(|&v| f64::from(v)).collect();
+    let gram: Vec<f64> = gram(&a).iter().map(|&v| f64::from(v)).collect();
     let c: Vec<f64> = (0..n).map(|i| a.column(i).iter().zip(&b).map(|(p, q)| f64::from(*p) * f64::from(*q)).sum()).collect();
     let largest = c.iter().fold(0.0f64, |m, v| m.max(*v));
     if largest <= 0.0 {

@@ -9,6 +9,7 @@ use super::from_psfs::nominal_focal;
 use super::taps::Interpolation;
 use crate::fft::{Fft2, Spectrum};
 use crate::image::Plane;
+use crate::nonnegative::gram;
 use crate::pose::{Pose, PoseGrid, project};
 use glam::{DMat3, DVec2};
 use nalgebra::{DMatrix, DVector};
@@ -218,6 +219,7 @@ impl WholeFrame<'_> {
             .iter()
             .map(|p| Particle { x: p.t_x, y: p.t_y, beta: p.theta_z_deg / step, weight: p.weight, ..Default::default() })
             .collect();
+        absorb(&mut particles);
         for _ in 0..2 {
             let low = particles.iter().fold(f64::INFINITY, |m, p| m.min(p.beta)).floor();
             for p in &mut particles {
@@ -245,6 +247,35 @@ struct Particle {
     weight: f64,
     home: (f64, f64, f64),
 }
+
+/// Poses of a grid stand in groups for continuous ones between them: the heaviest take in their neighbours.
+fn absorb(particles: &mut Vec<Particle>) {
+    particles.sort_by(|a, b| b.weight.total_cmp(&a.weight));
+    let mut out: Vec<Particle> = Vec::new();
+    for p in particles.iter() {
+        let distance = |q: &Particle| ((q.home.0 - p.x).powi(2) + (q.home.1 - p.y).powi(2) + (q.home.2 - p.beta).powi(2)).sqrt();
+        let near = out.iter_mut().map(|q| (distance(q), q)).min_by(|a, b| a.0.total_cmp(&b.0));
+        match near {
+            Some((d, q)) if d <= ABSORB => {
+                let s = q.weight + p.weight;
+                q.x = (q.x * q.weight + p.x * p.weight) / s;
+                q.y = (q.y * q.weight + p.y * p.weight) / s;
+                q.beta = (q.beta * q.weight + p.beta * p.weight) / s;
+                q.weight = s;
+            }
+            _ => out.push(Particle { home: (p.x, p.y, p.beta), ..*p }),
+        }
+    }
+    let total: f64 = out.iter().map(|p| p.weight).sum();
+    out.retain(|p| p.weight > 2e-3 * total);
+    out.truncate(MOST_PARTICLES);
+    *particles = out;
+}
+
+/// Distance in pixels (angles in steps of the base warps) within which grid poses become one continuous pose.
+const ABSORB: f64 = 1.2;
+/// Continuous poses at most: beyond, the tap system grows too large for what more poses explain.
+const MOST_PARTICLES: usize = 140;
 
 /// Particles that came together act as one.
 fn merge_close(particles: &mut Vec<Particle>) {
@@ -274,7 +305,7 @@ struct Taps {
 }
 
 /// Rows of the tap system: enough that thousands of differences speak for each tap.
-const TAP_ROWS: usize = 24_000;
+const TAP_ROWS: usize = 16_000;
 
 impl Taps {
     fn new(frame: &WholeFrame, particles: &[Particle], first_deg: f64, step_deg: f64, focal: f64, interpolation: Interpolation) -> Self {
@@ -321,7 +352,7 @@ impl Taps {
                     }
                 }
                 let b = DVector::from_column_slice(targets);
-                (a.tr_mul(&a).cast::<f64>(), a.tr_mul(&b).cast::<f64>())
+                (gram(&a).cast::<f64>(), a.tr_mul(&b).cast::<f64>())
             })
             .reduce(|| (DMatrix::zeros(n, n), DVector::zeros(n)), |(g, c), (g2, c2)| (g + g2, c + c2));
         Self { index, gram, c, interpolation }
