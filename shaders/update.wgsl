@@ -1,4 +1,5 @@
-// Trial step of log irradiance, u = u_old + s clamp(x, -1, 1), and E = exp(u), for one channel. s = 0 restores.
+// Trial step of log irradiance, u = u_old + clamp(s x, -1, 1), and E = exp(u), for one channel. s = 0 restores.
+// The clamp comes after s: for small s the step is then s x itself, which lowers the objective; a clamped x need not.
 struct Params {
     count: u32,
     row: u32,
@@ -16,7 +17,7 @@ struct Params {
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
     let i = (group.y * params.row + group.x) * 128u + local;
     if i < params.count {
-        let u = old[i] + params.step * clamp(solution[i], -1.0, 1.0);
+        let u = old[i] + clamp(params.step * solution[i], -1.0, 1.0);
         log_irradiance[i] = u;
         irradiance[i] = exp(u);
     }

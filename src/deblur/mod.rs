@@ -7,7 +7,7 @@
 //!
 //! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
 //!
-//! then tries u + s·clamp(δu, ±1) for s = 1, 1/2, 1/4, ... until the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with
+//! then tries u + clamp(s·δu, ±1) for s = 1, 1/2, 1/4, ... until the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with
 //! these weights) does not rise. λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
 //! The iteration stops when an outer step lowers the objective by less than `tolerance` of it, or at `outer` steps.
 
@@ -544,7 +544,7 @@ impl<'a> Solver<'a> {
                 if after <= before || step == 0.0 {
                     break;
                 }
-                step = if step > 0.02 { step * 0.5 } else { 0.0 };
+                step = if step > 1e-3 { step * 0.5 } else { 0.0 };
             }
             history.push(Iteration { before, after, step, reduction });
             if step == 0.0 {

@@ -274,7 +274,7 @@ impl LinearKernels {
         self.cg_scalars.step(gpu, &params, &[partials, scalars], [1, 1, 1])
     }
 
-    /// u = `old` + `step` · clamp(`solution`, -1, 1), E = exp(u).
+    /// u = `old` + clamp(`step` · `solution`, -1, 1), E = exp(u).
     pub fn update(
         &self,
         gpu: &Gpu,

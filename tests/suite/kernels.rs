@@ -80,11 +80,11 @@ fn scale() {
 
 fn check_update(count: usize) {
     // Steps beyond ±1 are clamped; u spans twelve decades of irradiance.
-    let (old, x) = (uniform(1, count, -14.0, 14.0), uniform(2, count, -2.0, 2.0));
+    let (old, x) = (uniform(1, count, -14.0, 14.0), uniform(2, count, -6.0, 6.0));
     for step in [1.0, 0.25, 0.0f32] {
         let (log, irradiance) = (poisoned(count + 3), poisoned(count + 3));
         run(&[k().linear.update(gpu(), &buffer(&old), &buffer(&x), &log, &irradiance, step, count)]);
-        let u: Vec<f64> = (0..count).map(|i| f64::from(old[i]) + f64::from(step) * f64::from(x[i]).clamp(-1.0, 1.0)).collect();
+        let u: Vec<f64> = (0..count).map(|i| f64::from(old[i]) + (f64::from(step) * f64::from(x[i])).clamp(-1.0, 1.0)).collect();
         let got = read(&log, count + 3);
         assert_close(&format!("u, step {step}"), &got[..count], &u, |i| 2.0 * HALF_ULP * (u[i].abs() + 1.0));
         assert_eq!(got[count..], [POISON; 3], "u: writes beyond its end");

@@ -151,7 +151,7 @@ fn check_step(pad: usize, robust: f32, black_clipped: bool) {
     let largest = step.iter().flatten().fold(0.0f64, |a, v| a.max(v.abs()));
     assert!(largest > 0.05, "the start leaves nothing to do: {largest}");
     let expected: Planes =
-        std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| u + f64::from(iteration.step) * d.clamp(-1.0, 1.0)).collect());
+        std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| u + (f64::from(iteration.step) * d).clamp(-1.0, 1.0)).collect());
     for (c, got) in logs(&got.irradiance).iter().enumerate() {
         for (i, (got, expected)) in got.iter().zip(&expected[c]).enumerate() {
             // f32 conjugate gradients at a condition of 1e3 after the preconditioner, and weights good to 2e-5.
@@ -359,4 +359,31 @@ fn numbers_that_are_none_are_refused() {
     }
     assert!(refused(&|o, _| o[1].noise[0][17] = 0.0), "noise of 0");
     assert!(refused(&|o, _| o[1].exposure_time = 0.0), "exposure time of 0");
+}
+
+#[test]
+fn a_step_that_would_raise_the_objective_is_halved() {
+    // A shaken frame that averages neighbours and counts much, a frame in place that counts little, a start whose columns
+    // alternate between twice the truth and almost nothing: its average is right. The step lowers the bright columns at
+    // once but may raise the dark ones by e only, and so spoils the average. Halving after the clamp does not help: the
+    // clamped direction itself goes up.
+    let poses = vec![Pose::planar(0.0, 0.0, 0.0, 0.5), Pose::planar(1.0, 0.0, 0.0, 0.5)];
+    let bracket = vec![observe(Tsf::identity(), 0.02, 1, 1), observe(Tsf::new(40.0, poses).expect("valid"), 0.5, 1, 10)];
+    let initial = truth(1).map_planes(|p| Plane::from_fn(p.width, p.height, |x, y| p.at(x, y) * if x % 2 == 0 { 2.0 } else { 1e-3 }));
+    let set = Settings { outer: 12, inner: 100, reweight: false, tolerance: 0.0, lambda: 1e-3, ..settings() };
+    let history = run(&bracket, &initial, 1, &set).report.history;
+    let k = history.iter().position(|i| i.step < 1.0).expect("an overshoot");
+    assert!(history.iter().all(|i| i.after <= i.before && i.step > 0.0), "{history:?}");
+    assert!(history[history.len() - 1].after < 0.1 * history[0].before, "{history:?}");
+    // The same place in f64: the whole step goes up, the damped one down.
+    let problem = problem(&bracket, 1, &set);
+    let weights = problem.weights(&planes(&initial));
+    let log = logs(&run(&bracket, &initial, 1, &Settings { outer: k, ..set.clone() }).irradiance);
+    let step = problem.step(&log, &weights);
+    let at = |s: f64| {
+        let moved: Planes = std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| u + (s * d).clamp(-1.0, 1.0)).collect());
+        problem.objective(&moved, &weights)
+    };
+    let (whole, damped, before) = (at(1.0), at(f64::from(history[k].step)), at(0.0));
+    assert!(whole > 1.001 * before && damped < before, "step {}: {before} -> {damped}, whole step {whole}", history[k].step);
 }
