@@ -26,6 +26,7 @@ fn main() {
             "tsf" => tsf = Some(TsfFile::parse(&std::fs::read_to_string(v).unwrap()).unwrap()),
             "lambda" => s.deblur.lambda = v.parse().unwrap(),
             "robust" => s.deblur.robust = v.parse().unwrap(),
+            "after" => s.deblur.robust_after = v.parse().unwrap(),
             "outer" => s.deblur.outer = v.parse().unwrap(),
             "inner" => s.deblur.inner = v.parse().unwrap(),
             "eps" => s.deblur.epsilon = v.parse().unwrap(),

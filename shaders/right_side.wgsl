@@ -27,5 +27,6 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let i = at(p, params.size.x);
     let e = irradiance[i];
     right_side[i] = e * back[i] - smoothness(p, params.size);
-    diagonal[i] = e * e * data_diagonal[i] + smoothness_diagonal(p, params.size) + 1e-20;
+    // The interpolation has negative lobes: beside masked pixels the approximate diagonal can fall below zero.
+    diagonal[i] = e * e * max(data_diagonal[i], 0.0) + smoothness_diagonal(p, params.size) + 1e-20;
 }

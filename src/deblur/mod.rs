@@ -53,6 +53,8 @@ pub struct Settings {
     pub tolerance: f64,
     /// Strength of the residual-driven weights of blurred frames; 0: none.
     pub robust: f32,
+    /// Outer iterations before the residual-driven weights: at the start residuals speak of the start, not of the frame.
+    pub robust_after: usize,
     /// Whether data weights follow the estimate; `false` freezes those of the start.
     pub reweight: bool,
     /// Interpolation of the warps.
@@ -68,6 +70,7 @@ impl Default for Settings {
             inner: 15,
             tolerance: 1e-4,
             robust: 2.0,
+            robust_after: 2,
             reweight: true,
             interpolation: Interpolation::default(),
         }
@@ -337,7 +340,7 @@ impl<'a> Solver<'a> {
     }
 
     /// Weights and weighted observations of all frames at the present estimate.
-    fn weigh(&self) -> Vec<Step> {
+    fn weigh(&self, robust: f32) -> Vec<Step> {
         let (s, data) = (&self.state, &self.kernels.data);
         let mut steps = Vec::new();
         let mut first = true;
@@ -365,7 +368,7 @@ impl<'a> Solver<'a> {
                         stride: self.frame.0,
                         accumulate: false,
                     };
-                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, self.settings.robust, &to));
+                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, robust, &to));
                 }
             }
         }
@@ -506,7 +509,8 @@ impl<'a> Solver<'a> {
         let (s, set) = (&self.state, self.settings);
         let n = self.latent.0 * self.latent.1;
         let (weigh, residuals, edges, start, iteration) =
-            (self.weigh(), self.residuals(true), self.edges(), self.start(), self.iteration());
+            (self.weigh(set.robust), self.residuals(true), self.edges(), self.start(), self.iteration());
+        let trusting = self.weigh(0.0);
         let evaluate = [self.residuals(false), self.edges()].concat();
         let update = |step: f32| -> Vec<Step> {
             (0..3).map(|c| self.kernels.linear.update(self.gpu, &s.old[c], &s.solution[c], &s.log[c], &s.irradiance[c], step, n)).collect()
@@ -516,7 +520,7 @@ impl<'a> Solver<'a> {
         let mut stop = Stop::IterationLimit;
         for outer in 0..set.outer {
             if outer == 0 || set.reweight {
-                self.gpu.submit(&weigh);
+                self.gpu.submit(if outer < set.robust_after { &trusting } else { &weigh });
             }
             self.gpu.submit(&residuals);
             self.gpu.submit(&edges);
