@@ -293,7 +293,7 @@ impl Run<'_> {
         let from_psfs = tsf::from_psfs(&psfs, &grid, w, h);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
         let tsf = frame.fit_grid(&grid, from_psfs.as_ref());
-        let tsf = tsf.map(|t| frame.refine(&t, self.settings.deblur.interpolation));
+        let tsf = tsf.map(|t| frame.refine(&t, self.settings.deblur.interpolation, 1));
         let detail = json!({
             "patches": psfs.iter().map(|(p, h)| json!({
                 "x": p.x, "y": p.y, "size": p.size, "score": p.score,
@@ -308,7 +308,7 @@ impl Run<'_> {
         let latent = latent.mean();
         let (blurred, weight) = self.luminance(i, &latent);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
-        tsf.map(|t| frame.refine(t, self.settings.deblur.interpolation))
+        tsf.map(|t| frame.refine(t, self.settings.deblur.interpolation, 1))
     }
 
     fn finish(

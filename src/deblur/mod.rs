@@ -64,13 +64,13 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            lambda: 5.0,
+            lambda: 4.0,
             epsilon: 0.01,
-            outer: 6,
-            inner: 15,
+            outer: 2,
+            inner: 16,
             tolerance: 1e-4,
-            robust: 2.0,
-            robust_after: 2,
+            robust: 1.0,
+            robust_after: 1,
             reweight: true,
             interpolation: Interpolation::default(),
         }

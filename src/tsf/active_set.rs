@@ -11,16 +11,17 @@ pub(super) struct ActiveSet {
 }
 
 impl ActiveSet {
-    /// `gradient(active)` returns Aᵀ(b - A h) for all candidates, `column(candidate)` a column of A. Starts at `start`. Each round adds
+    /// `target` is b, `gradient(r)` returns Aᵀr for all candidates, `column(candidate)` a column of A. Starts at `start`. Each round adds
     /// up to 16 local maxima of the gradient, solves for the active ones by coordinate descent and drops what became zero; stops when
     /// no candidate's gradient exceeds λ by more than a tenth.
     pub fn solve(
         &self,
         start: &[usize],
-        mut gradient: impl FnMut(&[(usize, f64)]) -> Vec<f64>,
+        target: &[f32],
+        mut gradient: impl FnMut(&[f32]) -> Vec<f64>,
         mut column: impl FnMut(usize) -> Vec<f32>,
     ) -> Vec<(usize, f64)> {
-        let c_all = gradient(&[]);
+        let c_all = gradient(target);
         let largest = c_all.iter().fold(0.0f64, |m, v| m.max(*v));
         if largest <= 0.0 {
             return Vec::new();
@@ -56,8 +57,14 @@ impl ActiveSet {
                 retain(row, &keep);
             }
             retain(&mut h, &keep);
-            let active: Vec<(usize, f64)> = ids.iter().copied().zip(h.iter().copied()).collect();
-            let g = gradient(&active);
+            let mut residual = target.to_vec();
+            for (a, weight) in columns.iter().zip(&h) {
+                let weight = *weight as f32;
+                for (r, v) in residual.iter_mut().zip(a) {
+                    *r -= weight * v;
+                }
+            }
+            let g = gradient(&residual);
             let most = g.iter().fold(0.0f64, |m, v| m.max(*v)) - lambda;
             if most < 0.1 * lambda {
                 break;

@@ -48,15 +48,9 @@ pub fn from_psfs(patches: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
         Some(out)
     };
     let columns: Vec<Option<Vec<(usize, f64)>>> = (0..n.0 * n.1 * n.2).map(entries).collect();
-    let target: Vec<f64> = patches.iter().flat_map(|(_, h)| h.values.data.iter().map(|&v| f64::from(v))).collect();
-    let gradient = |active: &[(usize, f64)]| {
-        let mut r = target.clone();
-        for (id, w) in active {
-            for (i, v) in columns[*id].iter().flatten() {
-                r[*i] -= w * v;
-            }
-        }
-        columns.iter().map(|c| c.as_ref().map_or(0.0, |c| c.iter().map(|(i, v)| r[*i] * v).sum())).collect::<Vec<f64>>()
+    let target: Vec<f32> = patches.iter().flat_map(|(_, h)| h.values.data.iter().copied()).collect();
+    let gradient = |r: &[f32]| {
+        columns.iter().map(|c| c.as_ref().map_or(0.0, |c| c.iter().map(|(i, v)| f64::from(r[*i]) * v).sum())).collect::<Vec<f64>>()
     };
     let column = |id: usize| {
         let mut dense = vec![0.0f32; target.len()];
@@ -65,6 +59,6 @@ pub fn from_psfs(patches: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
         }
         dense
     };
-    let found = ActiveSet { shape: n, lambda: 1e-2, rounds: 30 }.solve(&[], gradient, column);
+    let found = ActiveSet { shape: n, lambda: 1e-2, rounds: 30 }.solve(&[], &target, gradient, column);
     Tsf::new(focal, found.into_iter().map(|(id, w)| Pose { weight: w, ..pose(id) }).collect()).ok()
 }

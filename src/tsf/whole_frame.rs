@@ -146,16 +146,9 @@ impl WholeFrame<'_> {
                 })
                 .collect()
         };
-        let gradient = |active: &[(usize, f64)]| -> Vec<f64> {
-            let mut residual = targets.clone();
-            for (id, weight) in active {
-                let weight = *weight as f32;
-                for (v, a) in residual.iter_mut().zip(column(*id)) {
-                    *v -= weight * a;
-                }
-            }
+        let gradient = |residual: &[f32]| -> Vec<f64> {
             let mut image = vec![0.0f32; w * h];
-            for (row, v) in rows.iter().zip(&residual) {
+            for (row, v) in rows.iter().zip(residual) {
                 let (i, j) = row.other();
                 let v = v * row.weight.sqrt();
                 image[j * w + i] += v;
@@ -196,7 +189,7 @@ impl WholeFrame<'_> {
             ids.dedup();
             ids
         });
-        let found = ActiveSet { shape: (n, n, grid.angles_deg.len()), lambda: 1e-3, rounds: 24 }.solve(&start, gradient, column);
+        let found = ActiveSet { shape: (n, n, grid.angles_deg.len()), lambda: 2e-3, rounds: 20 }.solve(&start, &targets, gradient, column);
         let poses = found
             .into_iter()
             .map(|(id, weight)| {
@@ -206,11 +199,12 @@ impl WholeFrame<'_> {
         Tsf::new(focal, poses).ok()
     }
 
-    /// Continuous poses from `tsf`: translations, angles and weights move freely (Gauss-Newton with Levenberg damping).
+    /// Continuous poses from `tsf`: translations, angles and weights move freely (Gauss-Newton with Levenberg damping), by at most 0.9 px in
+    /// each of `rounds`.
     ///
     /// The blur is linear in the taps of a [`super::TapSet`], so that all of the frame's evidence about them is one Gram matrix over the
     /// taps near the poses; the poses enter only through how they splat on the taps.
-    pub fn refine(&self, tsf: &Tsf, interpolation: Interpolation) -> Tsf {
+    pub fn refine(&self, tsf: &Tsf, interpolation: Interpolation, rounds: usize) -> Tsf {
         let (w, h) = self.size();
         let corner = 0.5 * (w as f64).hypot(h as f64);
         let step = (0.7 / corner).to_degrees();
@@ -220,7 +214,7 @@ impl WholeFrame<'_> {
             .map(|p| Particle { x: p.t_x, y: p.t_y, beta: p.theta_z_deg / step, weight: p.weight, ..Default::default() })
             .collect();
         absorb(&mut particles);
-        for _ in 0..2 {
+        for _ in 0..rounds {
             let low = particles.iter().fold(f64::INFINITY, |m, p| m.min(p.beta)).floor();
             for p in &mut particles {
                 p.beta -= low;
@@ -273,9 +267,9 @@ fn absorb(particles: &mut Vec<Particle>) {
 }
 
 /// Distance in pixels (angles in steps of the base warps) within which grid poses become one continuous pose.
-const ABSORB: f64 = 1.2;
+const ABSORB: f64 = 1.4;
 /// Continuous poses at most: beyond, the tap system grows too large for what more poses explain.
-const MOST_PARTICLES: usize = 140;
+const MOST_PARTICLES: usize = 90;
 
 /// Particles that came together act as one.
 fn merge_close(particles: &mut Vec<Particle>) {
@@ -305,7 +299,7 @@ struct Taps {
 }
 
 /// Rows of the tap system: enough that thousands of differences speak for each tap.
-const TAP_ROWS: usize = 16_000;
+const TAP_ROWS: usize = 12_000;
 
 impl Taps {
     fn new(frame: &WholeFrame, particles: &[Particle], first_deg: f64, step_deg: f64, focal: f64, interpolation: Interpolation) -> Self {
