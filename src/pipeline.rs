@@ -66,6 +66,8 @@ pub struct Outcome {
 const LARGEST_PAD: f64 = 0.15;
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
+/// Outer iterations for the sharp frames alone.
+const SHARP_OUTER: usize = 5;
 /// Local PSFs per blurred frame.
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
@@ -193,8 +195,9 @@ impl Run<'_> {
         for &i in &still {
             tsfs[i] = Some(Tsf::identity());
         }
-        let base = self
-            .timed("sharp frames", |run| run.solve(&start_frames, &vec![Some(Tsf::identity()); frames.len()], &initial, 0, 0.05, 0.10))?;
+        let base = self.timed("sharp frames", |run| {
+            run.solve(&start_frames, &vec![Some(Tsf::identity()); frames.len()], &initial, 0, &alone, 0.05, 0.10)
+        })?;
         let mut latent = base.cropped();
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
@@ -226,7 +229,10 @@ impl Run<'_> {
                 let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
                 let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
                 let from = latent.map_planes(|p| p.padded(pad));
-                solution = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, at(0.3), at(1.0)))?;
+                // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
+                let inner = if round + 1 < rounds { self.settings.deblur.inner / 2 } else { self.settings.deblur.inner };
+                let settings = deblur::Settings { inner, ..self.settings.deblur.clone() };
+                solution = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             }
         }
         self.progress("finishing", 0.99)?;
@@ -234,7 +240,16 @@ impl Run<'_> {
     }
 
     /// Solves for the frames `ids`; progress runs from `from` to `to`.
-    fn solve(&mut self, ids: &[usize], tsfs: &[Option<Tsf>], initial: &Rgb, pad: usize, from: f32, to: f32) -> Result<Solution> {
+    fn solve(
+        &mut self,
+        ids: &[usize],
+        tsfs: &[Option<Tsf>],
+        initial: &Rgb,
+        pad: usize,
+        settings: &deblur::Settings,
+        from: f32,
+        to: f32,
+    ) -> Result<Solution> {
         let frames = self.bracket.frames();
         let observations: Vec<Observation> = ids
             .iter()
@@ -247,14 +262,10 @@ impl Run<'_> {
                 tsf: tsfs[i].clone().unwrap_or_else(Tsf::identity),
             })
             .collect();
-        let padded = if pad > 0 && initial.size() == self.bracket.size() { initial.map_planes(|p| p.padded(pad)) } else { initial.clone() };
+        let moving = observations.iter().any(|o| !o.tsf.is_identity());
+        let stage = if moving { "deblurring" } else { "merging the sharp frames" };
         let events = &mut self.events;
-        let stage = if ids.iter().any(|&i| !observations[ids.iter().position(|&k| k == i).unwrap_or(0)].tsf.is_identity()) {
-            "deblurring"
-        } else {
-            "merging the sharp frames"
-        };
-        deblur::solve(&self.gpu, &self.kernels, &observations, &padded, pad, &self.settings.deblur, &mut |f| {
+        deblur::solve(&self.gpu, &self.kernels, &observations, initial, pad, settings, &mut |f| {
             events(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f })
         })
     }
@@ -285,7 +296,6 @@ impl Run<'_> {
         let latent = latent.mean();
         let (w, h) = latent.size();
         let (blurred, weight) = self.luminance(i, &latent);
-        let clock = Instant::now();
         let patches = psf::choose(&latent, &weight, PATCH_SIZE.min(w / 2).min(h / 2).max(16), PATCHES);
         let psfs: Vec<(psf::Patch, psf::Psf)> =
             patches.iter().filter_map(|p| Some((*p, psf::estimate(&latent, 0, &blurred, &weight, p, GRID_RADIUS)?))).collect();

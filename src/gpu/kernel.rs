@@ -54,14 +54,7 @@ impl Kernel {
 
     /// A dispatch of `groups` workgroups with these parameters and buffers.
     pub fn step<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], groups: [u32; 3]) -> Step {
-        let bytes = bytemuck::bytes_of(params);
-        let uniform = gpu.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some(self.label),
-            size: bytes.len() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        gpu.queue.write_buffer(&uniform, 0, bytes);
+        let uniform = gpu.uniform(self.label, bytemuck::bytes_of(params));
         let entries: Vec<_> = std::iter::once(&uniform)
             .chain(buffers.iter().copied())
             .enumerate()

@@ -135,6 +135,18 @@ impl Gpu {
         buffer
     }
 
+    /// A uniform buffer that holds `bytes`.
+    pub fn uniform(&self, label: &str, bytes: &[u8]) -> wgpu::Buffer {
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: bytes.len() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.queue.write_buffer(&buffer, 0, bytes);
+        buffer
+    }
+
     /// Runs steps and waits for none of them.
     pub fn submit(&self, steps: &[Step]) {
         // A submission is bounded so that a slow driver's watchdog does not fire.

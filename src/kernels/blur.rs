@@ -135,8 +135,7 @@ pub struct Blur {
     bases: usize,
     reach: i32,
     base_table: wgpu::Buffer,
-    forward_taps: wgpu::Buffer,
-    adjoint_taps: wgpu::Buffer,
+    chunks: Vec<Chunk>,
 }
 
 /// Appends the runs of consecutive shifts in x of taps sorted by (dy, dx), in the layout of shaders/tap_sum.wgsl.
@@ -144,24 +143,63 @@ fn append_runs(taps: &[(i32, i32, f64)], plane: i32, table: &mut Vec<[i32; 4]>) 
     for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
         // Load m is at p - dx with dx descending: weight t[m] belongs to the m-th largest shift.
         let (dy, dx) = (run[0].0, run[run.len() - 1].1);
-        let blocks = (run.len() + 3).div_ceil(4);
+        let blocks = (run.len() + 7).div_ceil(4);
         table.push([plane, blocks as i32, -dy, -dx]);
         let weight = |m: usize| run.len().checked_sub(m + 1).map_or(0, |i| (run[i].2 as f32).to_bits() as i32);
         table.extend((0..blocks).map(|b| std::array::from_fn(|c| weight(4 * b + c))));
     }
 }
 
-/// Group index and runs of all groups.
-fn tap_table(groups: &[(i32, Vec<(i32, i32, f64)>)]) -> Vec<[i32; 4]> {
-    let head = (groups.len() + 1).div_ceil(4);
-    let mut table = vec![[0i32; 4]; head];
-    for (g, (plane, taps)) in groups.iter().enumerate() {
+/// `vec4i` of a tap table: what 64 KiB, the least that every adapter binds as a uniform, hold.
+const TABLE: usize = 4096;
+/// Taps of one group at most, so that even taps without neighbours (three entries each) fit a table.
+const GROUP_TAPS: usize = 1300;
+
+/// Shifts (dy, dx, weight) of one base warp, sorted.
+type Group = Vec<(i32, i32, f64)>;
+
+/// Taps of consecutive base warps that share one table.
+struct Chunk {
+    first: usize,
+    count: usize,
+    forward: wgpu::Buffer,
+    adjoint: wgpu::Buffer,
+}
+
+/// Group index and runs of `groups`, whose first is base warp `first`; the adjoint's taps are mirrored and read the frame.
+fn tap_table(groups: &[Group], first: usize, adjoint: bool) -> Vec<[i32; 4]> {
+    let mut table = vec![[0i32; 4]; (groups.len() + 1).div_ceil(4)];
+    for (g, taps) in groups.iter().enumerate() {
         table[g / 4][g % 4] = table.len() as i32;
-        append_runs(taps, *plane, &mut table);
+        if adjoint {
+            let mirrored: Group = taps.iter().rev().map(|t| (-t.0, -t.1, t.2)).collect();
+            append_runs(&mirrored, 0, &mut table);
+        } else {
+            append_runs(taps, (first + g) as i32, &mut table);
+        }
     }
     let (n, end) = (groups.len(), table.len() as i32);
     table[n / 4][n % 4] = end;
     table
+}
+
+/// As few chunks as hold all groups.
+fn chunks(gpu: &Gpu, groups: &[Group]) -> Vec<Chunk> {
+    let (mut out, mut first) = (Vec::new(), 0);
+    while first < groups.len() {
+        let mut count = 1;
+        while first + count < groups.len() && tap_table(&groups[first..=first + count], first, false).len() <= TABLE {
+            count += 1;
+        }
+        let table = |adjoint: bool| {
+            let mut t = tap_table(&groups[first..first + count], first, adjoint);
+            t.resize(TABLE, [0; 4]);
+            gpu.uniform("taps", bytemuck::cast_slice(&t))
+        };
+        out.push(Chunk { first, count, forward: table(false), adjoint: table(true) });
+        first += count;
+    }
+    out
 }
 
 impl Blur {
@@ -173,32 +211,27 @@ impl Blur {
         let scratch_size = (frame.0 + (x1 - x0) as usize, frame.1 + (y1 - y0) as usize);
         let half = DVec2::new(scratch_size.0 as f64, scratch_size.1 as f64) * 0.5;
         let reach = taps.bases.iter().map(|h| (kernels.support as f64 * spread(h, half) + 0.5).floor() as i32).max().unwrap_or(0);
-        let table: Vec<BaseTable> = taps
-            .bases
-            .iter()
-            .map(|h| {
-                let ((abc, def), (abc_inverse, def_inverse)) = (displacement_table(&h.inverse()), displacement_table(h));
-                BaseTable { abc, def, abc_inverse, def_inverse }
-            })
-            .collect();
-        let of_base = |b: usize, sign: i32| {
-            let mut t: Vec<_> = taps.taps.iter().filter(|t| t.base == b).map(|t| (sign * t.dy, sign * t.dx, t.weight)).collect();
-            t.sort_by_key(|t| (t.0, t.1));
-            t
-        };
-        let groups =
-            |sign: i32| -> Vec<_> { (0..taps.bases.len()).map(|b| (if sign > 0 { b as i32 } else { 0 }, of_base(b, sign))).collect() };
+        // A base warp with more taps than a table holds stands there several times.
+        let (mut table, mut groups) = (Vec::new(), Vec::new());
+        for (b, h) in taps.bases.iter().enumerate() {
+            let ((abc, def), (abc_inverse, def_inverse)) = (displacement_table(&h.inverse()), displacement_table(h));
+            let mut own: Group = taps.taps.iter().filter(|t| t.base == b).map(|t| (t.dy, t.dx, t.weight)).collect();
+            own.sort_by_key(|t| (t.0, t.1));
+            for part in own.chunks(GROUP_TAPS) {
+                table.push(BaseTable { abc, def, abc_inverse, def_inverse });
+                groups.push(part.to_vec());
+            }
+        }
         Self {
             latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
             frame,
             pad,
             scratch_size,
             origin: [-x1, -y1],
-            bases: taps.bases.len(),
+            bases: groups.len(),
             reach,
             base_table: gpu.table("base warps", &table),
-            forward_taps: gpu.table("taps", &tap_table(&groups(1))),
-            adjoint_taps: gpu.table("mirrored taps", &tap_table(&groups(-1))),
+            chunks: chunks(gpu, &groups),
         }
     }
 
@@ -212,10 +245,11 @@ impl Blur {
         self.scratch_size.0 * self.scratch_size.1
     }
 
-    /// (first base, number of bases) of the passes that the scratch allows.
-    fn passes(&self, scratch: &Scratch) -> Vec<(usize, usize)> {
-        let at_once = (scratch.capacity / self.scratch_needed()).clamp(1, self.bases);
-        (0..self.bases).step_by(at_once).map(|b| (b, at_once.min(self.bases - b))).collect()
+    /// (tap tables, first base, number of bases) of the passes that the scratch allows.
+    fn passes(&self, scratch: &Scratch) -> Vec<(&Chunk, usize, usize)> {
+        let at_once = (scratch.capacity / self.scratch_needed()).max(1);
+        let of_chunk = |c: &'_ Chunk| (c.first..c.first + c.count).step_by(at_once).map(move |b| (b, at_once)).collect::<Vec<_>>();
+        self.chunks.iter().flat_map(|c| of_chunk(c).into_iter().map(move |(b, n)| (c, b, n.min(c.first + c.count - b)))).collect()
     }
 
     fn warp_params(&self, first: usize, bases: usize) -> WarpParams {
@@ -233,7 +267,7 @@ impl Blur {
     /// Steps of `frame = K latent`.
     pub fn forward(&self, gpu: &Gpu, kernels: &BlurKernels, scratch: &Scratch, latent: &Channels, frame: &Channels) -> Vec<Step> {
         let mut steps = Vec::new();
-        for (first, n) in self.passes(scratch) {
+        for (chunk, first, n) in self.passes(scratch) {
             let s = &scratch.planes;
             let buffers = [&self.base_table, &latent[0], &latent[1], &latent[2], &s[0], &s[1], &s[2]];
             steps.push(kernels.warp.step_2d(gpu, &self.warp_params(first, n), &buffers, self.scratch_size, n));
@@ -242,12 +276,12 @@ impl Blur {
                 out_size: [self.frame.0 as i32, self.frame.1 as i32],
                 origin: [-self.origin[0], -self.origin[1]],
                 accumulate: u32::from(first > 0),
-                first_group: first as u32,
+                first_group: (first - chunk.first) as u32,
                 span: n as u32,
                 first_plane: first as u32,
             };
-            let buffers = [&self.forward_taps, &s[0], &s[1], &s[2], &frame[0], &frame[1], &frame[2]];
-            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.frame.0.div_ceil(4), self.frame.1), 1));
+            let buffers = [&chunk.forward, &s[0], &s[1], &s[2], &frame[0], &frame[1], &frame[2]];
+            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.frame.0.div_ceil(8), self.frame.1), 1));
         }
         steps
     }
@@ -263,19 +297,19 @@ impl Blur {
         factor: f32,
     ) -> Vec<Step> {
         let mut steps = Vec::new();
-        for (first, n) in self.passes(scratch) {
+        for (chunk, first, n) in self.passes(scratch) {
             let s = &scratch.planes;
             let params = TapParams {
                 in_size: [self.frame.0 as i32, self.frame.1 as i32],
                 out_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
                 origin: self.origin,
                 accumulate: 0,
-                first_group: first as u32,
+                first_group: (first - chunk.first) as u32,
                 span: 1,
                 first_plane: 0,
             };
-            let buffers = [&self.adjoint_taps, &frame[0], &frame[1], &frame[2], &s[0], &s[1], &s[2]];
-            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.scratch_size.0.div_ceil(4), self.scratch_size.1), n));
+            let buffers = [&chunk.adjoint, &frame[0], &frame[1], &frame[2], &s[0], &s[1], &s[2]];
+            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.scratch_size.0.div_ceil(8), self.scratch_size.1), n));
             let params = WarpAdjointParams { warp: self.warp_params(first, n), reach: self.reach, factor };
             let buffers = [&self.base_table, &s[0], &s[1], &s[2], &latent[0], &latent[1], &latent[2]];
             steps.push(kernels.warp_adjoint.step_2d(gpu, &params, &buffers, self.latent, 1));
