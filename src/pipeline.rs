@@ -195,6 +195,8 @@ impl Run<'_> {
         for &i in &still {
             tsfs[i] = Some(Tsf::identity());
         }
+        // Without blur an iteration costs next to nothing: this solution may converge.
+        let alone = deblur::Settings { outer: SHARP_OUTER, ..self.settings.deblur.clone() };
         let base = self.timed("sharp frames", |run| {
             run.solve(&start_frames, &vec![Some(Tsf::identity()); frames.len()], &initial, 0, &alone, 0.05, 0.10)
         })?;

@@ -64,7 +64,7 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            lambda: 4.0,
+            lambda: 3.0,
             epsilon: 0.01,
             outer: 2,
             inner: 16,
