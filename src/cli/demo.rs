@@ -3,6 +3,8 @@
 use crate::baseline;
 use crate::exposure::Frame;
 use crate::image::Rgb;
+use crate::io::exr::Radiometry;
+use crate::io::output::Output;
 use crate::metrics::{Judge, Score, score};
 use crate::pipeline::{self, Event, Settings};
 use crate::response::Response;
@@ -11,7 +13,7 @@ use crate::tonemap::ToneMap;
 use crate::tsf::{TsfEntry, TsfFile};
 use anyhow::Context;
 use image::{RgbImage, imageops};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Size of the demo's frames, pixels.
 const SIZE: (usize, usize) = (512, 384);
@@ -41,33 +43,31 @@ pub fn bracket() -> crate::error::Result<SyntheticBracket> {
     synth::capture(&scene, &Camera::default(), &frames, MEDIAN, SEED)
 }
 
-/// Runs the demo and writes everything to `output_dir`, which is made if need be; files of an earlier demo are replaced.
-/// `progress` hears the merge's events and can stop it by returning `false`.
+/// Runs the demo and writes everything to `output_dir`, which is made if need be; files of an earlier demo are replaced, other
+/// files are not. `events` hears the merge's events and can stop it by returning `false`. Returns what was gained and written,
+/// in words.
 ///
 /// # Errors
-/// What the merge reports, and files that cannot be written.
-pub fn run(output_dir: &Path, progress: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<()> {
+/// What the merge reports, and files that cannot be written; nothing is written then.
+pub fn run(output_dir: &Path, events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<String> {
+    // Everything that can be refused comes before the work, and every file is complete before the first is renamed.
     std::fs::create_dir_all(output_dir)
         .with_context(|| format!("{}: cannot be made; choose another --output-dir", output_dir.display()))?;
-    progress(Event::Progress { stage: "photographing a room at night".into(), fraction: 0.0 });
+    let targets = targets(output_dir)?;
+    events(Event::Progress { stage: "photographing a room at night".into(), fraction: 0.0 });
     let synthetic = bracket()?;
     let frames = synthetic.bracket.frames();
-    for frame in frames {
-        write_png(&output_dir.join(&frame.name), &codes(frame))?;
-    }
-    write_exr(&output_dir.join("truth.exr"), &synthetic.truth)?;
-    write_json(&output_dir.join("truth_tsf.json"), &serde_json::to_value(true_tsfs(&synthetic))?)?;
-
     let response = Response::Srgb;
-    let outcome = pipeline::merge(&synthetic.bracket, &response, &Settings::default(), None, progress)?;
-    write_exr(&output_dir.join("unshaken.exr"), &outcome.irradiance)?;
+    let outcome = pipeline::merge(&synthetic.bracket, &response, &Settings::default(), None, events)?;
 
     let all: Vec<usize> = (0..frames.len()).collect();
     let sharp: Vec<usize> = all.iter().copied().filter(|&i| synthetic.sharp[i]).collect();
     let plain = baseline::merge(&synthetic.bracket, &response, &all);
     let sharp_only = baseline::merge(&synthetic.bracket, &response, &sharp);
-    let seconds = frames[outcome.reference].exposure_time as f32;
+    let radiometry = Radiometry { exposure_time: frames[outcome.reference].exposure_time, frame: frames[outcome.reference].name.clone() };
+    let seconds = radiometry.exposure_time as f32;
     let unshaken = outcome.irradiance.map_planes(|p| p.map(|v| v / seconds));
+    let truth = synthetic.truth.map_planes(|p| p.map(|v| v * seconds));
     let shortest = frames.iter().map(|f| f.exposure_time).fold(f64::INFINITY, f64::min);
     let judge = Judge { limit: Some((0.98 / shortest) as f32), ..Judge::default() };
     let judged = |image: &Rgb| score(image, &synthetic.truth, &judge);
@@ -75,29 +75,88 @@ pub fn run(output_dir: &Path, progress: &mut dyn FnMut(Event) -> bool) -> anyhow
 
     let shaken = as_taken(&frames[frames.len() - 1], &response, &synthetic.truth);
     let columns = [("SHAKEN, 2 S", &shaken), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp_only), ("UNSHAKEN", &unshaken)];
-    write_png(&output_dir.join("before-after.png"), &comparison(&columns, &ToneMap::fit(&unshaken)))?;
     let mut report = outcome.report;
     if let Some(fields) = report.as_object_mut() {
-        let [plain, sharp_only, unshaken] = scores;
-        fields.insert("demo".into(), serde_json::json!({ "plain": plain, "sharp_only": sharp_only, "unshaken": unshaken }));
+        let [plain, sharp_only, unshaken] = &scores;
+        fields.insert(MARK.into(), serde_json::json!({ "plain": plain, "sharp_only": sharp_only, "unshaken": unshaken }));
     }
-    write_json(&output_dir.join("report.json"), &report)?;
-    println!("{}", summary(&scores, output_dir));
-    Ok(())
+    let mut staged = vec![
+        // The first to be renamed: by it a later demo knows the folder.
+        targets.report.stage_json(&report)?,
+        targets.picture.stage_png(&comparison(&columns, &ToneMap::fit(&unshaken)))?,
+        targets.unshaken.stage_exr(&outcome.irradiance, &radiometry)?,
+        targets.truth.stage_exr(&truth, &radiometry)?,
+        targets.true_tsfs.stage_json(&true_tsfs(&synthetic))?,
+    ];
+    for (frame, target) in frames.iter().zip(&targets.frames) {
+        staged.push(target.stage_png(&codes(frame))?);
+    }
+    for file in staged {
+        file.commit()?;
+    }
+    Ok(summary(&scores, &targets))
 }
 
-/// The demo's last words: scores of the plain merge, of the sharp frames alone, of the reconstruction.
-fn summary([plain, sharp_only, unshaken]: &[Score; 3], output_dir: &Path) -> String {
+/// The field by which the report tells that it is a demo's.
+const MARK: &str = "demo";
+
+/// The files that the demo writes.
+struct Targets {
+    report: Output,
+    picture: Output,
+    unshaken: Output,
+    truth: Output,
+    true_tsfs: Output,
+    frames: [Output; 5],
+}
+
+/// Checks that all files can be written; what is there must be an earlier demo's, for nobody asked to replace photographs.
+fn targets(folder: &Path) -> anyhow::Result<Targets> {
+    let earlier = crate::io::read_text(&folder.join(REPORT))
+        .ok()
+        .and_then(|text| serde_json::from_str::<serde_json::Value>(&text).ok())
+        .is_some_and(|report| report.get(MARK).is_some());
+    let at = |name: &str| -> anyhow::Result<Output> {
+        let path: PathBuf = folder.join(name);
+        if !earlier && path.symlink_metadata().is_ok() {
+            anyhow::bail!("{}: exists and is not of an earlier demo; choose another --output-dir", path.display());
+        }
+        Ok(Output::check(&path, true)?)
+    };
+    Ok(Targets {
+        report: at(REPORT)?,
+        picture: at("before-after.png")?,
+        unshaken: at("unshaken.exr")?,
+        truth: at("truth.exr")?,
+        true_tsfs: at("truth_tsf.json")?,
+        frames: [at("frame1.png")?, at("frame2.png")?, at("frame3.png")?, at("frame4.png")?, at("frame5.png")?],
+    })
+}
+
+const REPORT: &str = "report.json";
+
+/// The demo's last words: scores of the plain merge, of the sharp frames alone, of the reconstruction; the files.
+fn summary([plain, sharp_only, unshaken]: &[Score; 3], targets: &Targets) -> String {
     let line = |name: &str, s: &Score| format!("  {name:<28} {:5.1} dB   edges {:.2} of the truth's\n", s.pu_psnr, s.edge_ratio);
-    format!(
-        "PU21-PSNR against the true irradiance:\n{}{}{}gain: {:+.1} dB over the plain merge, {:+.1} dB over leaving the shaken frames out\nwritten to {}: before-after.png, unshaken.exr, report.json, the frames and the truth",
-        line("plain merge of all frames", plain),
-        line("merge of the sharp frames", sharp_only),
-        line("unshaken", unshaken),
+    let file = |target: &Output, what: &str| format!("  {:<40} {what}\n", target.path().display());
+    let [first, .., last] = &targets.frames;
+    let mut text = String::from("PU21-PSNR against the true irradiance:\n");
+    text += &line("plain merge of all frames", plain);
+    text += &line("merge of the sharp frames", sharp_only);
+    text += &line("unshaken", unshaken);
+    text += &format!(
+        "gain: {:+.1} dB over the plain merge, {:+.1} dB over leaving the shaken frames out\nwrote\n",
         unshaken.pu_psnr - plain.pu_psnr,
-        unshaken.pu_psnr - sharp_only.pu_psnr,
-        output_dir.display()
-    )
+        unshaken.pu_psnr - sharp_only.pu_psnr
+    );
+    text += &file(&targets.picture, "before and after: look at this first");
+    text += &file(&targets.unshaken, "the result, linear");
+    text += &file(&targets.report, "everything that was estimated");
+    text += &file(first, &format!("to {}: the frames", last.path().file_name().unwrap_or_default().display()));
+    text += &file(&targets.truth, "the true irradiance, on the result's scale");
+    text += &file(&targets.true_tsfs, "the true camera motion");
+    text.truncate(text.trim_end().len());
+    text
 }
 
 /// Irradiance of one frame for the picture: towards clipping it turns to the scene's brightest white, as a photograph's does.
@@ -172,18 +231,4 @@ fn codes(frame: &Frame) -> RgbImage {
     RgbImage::from_fn(width as u32, height as u32, |x, y| {
         image::Rgb(frame.intensity.pixel(y as usize * width + x as usize).map(|v| (v * 255.0).round() as u8))
     })
-}
-
-fn write_png(path: &Path, image: &RgbImage) -> anyhow::Result<()> {
-    image.save(path).with_context(|| format!("{}: cannot be written", path.display()))
-}
-
-fn write_exr(path: &Path, image: &Rgb) -> anyhow::Result<()> {
-    let (width, height) = image.size();
-    exr::prelude::write_rgb_file(path, width, height, |x, y| image.pixel(y * width + x).into())
-        .with_context(|| format!("{}: cannot be written", path.display()))
-}
-
-fn write_json(path: &Path, value: &serde_json::Value) -> anyhow::Result<()> {
-    std::fs::write(path, serde_json::to_string_pretty(value)?).with_context(|| format!("{}: cannot be written", path.display()))
 }

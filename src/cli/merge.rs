@@ -1,8 +1,7 @@
 //! `unshaken merge`.
 
 use super::args::MergeArgs;
-use super::progress::Progress;
-use super::{Usage, frames};
+use super::{Usage, frames, with_progress};
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::Radiometry;
@@ -31,38 +30,36 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         check_tsf_names(file, path, &args.frames)?;
     }
 
-    let mut progress = Progress::new();
-    progress.at("reading frames", 0.0);
-    let bracket = frames::read(&args.frames, times)?;
-    if args.response.is_none() {
-        progress
-            .warn("no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it");
-    }
-    let mut events = |event| {
-        match event {
-            Event::Progress { stage, fraction } => progress.at(&stage, fraction),
-            Event::Warning(text) => progress.warn(&text),
+    let text = with_progress(|events| {
+        events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
+        let bracket = frames::read(&args.frames, times)?;
+        if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
+            check_tsfs(file, path, &bracket)?;
         }
-        true
-    };
-    let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), &mut events)?;
-    progress.at("writing", 1.0);
+        if args.response.is_none() {
+            let text =
+                "no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it";
+            events(Event::Warning(text.into()));
+        }
+        let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
+        events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
 
-    // All are complete before the first is renamed.
-    let reference = &bracket.frames()[outcome.reference];
-    let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
-    let mut staged = vec![exr.stage_exr(&outcome.irradiance, &radiometry)?];
-    if let Some(target) = &preview {
-        staged.push(target.stage_png(&crate::tonemap::preview(&outcome.irradiance))?);
-    }
-    if let Some(target) = &report {
-        staged.push(target.stage_json(&outcome.report)?);
-    }
-    for s in staged {
-        s.commit()?;
-    }
-    drop(progress);
-    println!("{}", summary(args, &bracket, outcome.reference));
+        // All are complete before the first is renamed.
+        let reference = &bracket.frames()[outcome.reference];
+        let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
+        let mut staged = vec![exr.stage_exr(&outcome.irradiance, &radiometry)?];
+        if let Some(target) = &preview {
+            staged.push(target.stage_png(&crate::tonemap::preview(&outcome.irradiance))?);
+        }
+        if let Some(target) = &report {
+            staged.push(target.stage_json(&outcome.report)?);
+        }
+        for file in staged {
+            file.commit()?;
+        }
+        Ok(summary(args, &bracket, outcome.reference))
+    })?;
+    println!("{text}");
     Ok(())
 }
 
@@ -176,6 +173,15 @@ fn check_tsf_names(file: &TsfFile, path: &Path, frames: &[PathBuf]) -> Result<()
     }
     if !file.frames.iter().any(|e| names.contains(&e.frame)) {
         return refuse(format!("holds no TSF of any of the frames ({}); it names frames by file name, without folder", names.join(", ")));
+    }
+    Ok(())
+}
+
+/// Refuses TSFs that do not fit the frames before the work begins.
+fn check_tsfs(file: &TsfFile, path: &Path, bracket: &Bracket) -> Result<(), Error> {
+    let (width, height) = bracket.size();
+    for frame in bracket.frames() {
+        file.find(&frame.name, width, height).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })?;
     }
     Ok(())
 }

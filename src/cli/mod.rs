@@ -33,7 +33,7 @@ pub fn run() -> ExitCode {
     let done = match line.command {
         args::Command::Merge(a) => merge::run(&a),
         args::Command::Calibrate(a) => calibrate::run(&a),
-        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)),
+        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)).map(|text| println!("{text}")),
         args::Command::Adapters => adapters::run(),
     };
     match done {
@@ -42,7 +42,7 @@ pub fn run() -> ExitCode {
     }
 }
 
-/// Runs a job whose events go to the progress bar and to warnings.
+/// Runs a job whose events go to the progress bar and to warnings. The bar is gone when it returns.
 fn with_progress<T>(job: impl FnOnce(&mut dyn FnMut(Event) -> bool) -> anyhow::Result<T>) -> anyhow::Result<T> {
     let mut progress = progress::Progress::new();
     job(&mut |event| {
