@@ -41,6 +41,10 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
                 "no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it";
             events(Event::Warning(text.into()));
         }
+        if args.frames.len() == settings.exclude.len() + 1 {
+            let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
+            events(Event::Warning(text.into()));
+        }
         let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
 
