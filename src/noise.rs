@@ -75,19 +75,37 @@ const QUANTILE_OF_NOISE: f64 = 0.554;
 /// channels are pooled, since shot and read noise depend on the exposure alone; blurred frames contribute most, as blur
 /// removes texture but not noise. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is usable.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
+    let at_lag = |lag| fit(&samples(frames, exposures, response, lag));
+    match (at_lag(1), at_lag(COARSE_LAG)) {
+        // White noise reads the same at both lags, texture only lifts the coarse one a little.
+        (Some(fine), Some(coarse)) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
+        (Some(fine), _) => fine,
+        (None, Some(coarse)) => coarse,
+        (None, None) => NoiseModel::from_electrons(10_000.0, 5.0),
+    }
+}
+
+/// Distance in pixels of the taps of the second high-pass, for noise that a file format has made smooth.
+const COARSE_LAG: usize = 3;
+/// Ratio of the two variances from which the noise counts as smoothed (JPEG drops the finest structure).
+const CORRELATED: f64 = 2.5;
+/// Exposures at which they are compared.
+const MID_EXPOSURES: [f64; 2] = [0.02, 0.2];
+
+/// (exposure, variance, number of blocks) of bins of equal population along the exposure, none wider than a factor of 1.5.
+fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<(f64, f64, f64)> {
     let mut blocks: Vec<(f64, f64)> = Vec::new();
     for (frame, x) in frames.iter().zip(exposures) {
         for c in 0..3 {
             let quantum = quantisation(response, c, frame.levels);
-            collect_blocks(&frame.intensity.0[c], &x.0[c], &quantum, &mut blocks);
+            collect_blocks(&frame.intensity.0[c], &x.0[c], lag, &quantum, &mut blocks);
         }
     }
     blocks.sort_by(|a, b| a.0.total_cmp(&b.0));
-    // Bins of equal population along the exposure, but none wider than a factor of 1.5.
-    let mut samples: Vec<(f64, f64, f64)> = Vec::new();
+    let mut samples = Vec::new();
     let mut i = 0;
     while i < blocks.len() {
-        let end = blocks[i..].partition_point(|b| b.0 < 1.5 * blocks[i].0) + i;
+        let end = blocks[i..].partition_point(|b| b.0 <= 1.5 * blocks[i].0) + i;
         let end = end.min(i + (blocks.len() / 40).max(200));
         if end - i >= 60 {
             let mut v: Vec<f64> = blocks[i..end].iter().map(|b| b.1).collect();
@@ -100,26 +118,22 @@ pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> Noi
         }
         i = end;
     }
-    fit(&samples).unwrap_or(NoiseModel::from_electrons(10_000.0, 5.0))
+    samples
 }
 
-fn collect_blocks(z: &Plane, x: &Plane, quantum: &impl Fn(f64) -> f64, blocks: &mut Vec<(f64, f64)>) {
+/// Appends (mean exposure, high-pass variance) of the blocks of one channel that no clipping touches.
+fn collect_blocks(z: &Plane, x: &Plane, lag: usize, quantum: &impl Fn(f64) -> f64, blocks: &mut Vec<(f64, f64)>) {
     let (w, h) = x.size();
-    for by in (1..h.saturating_sub(BLOCK)).step_by(BLOCK) {
-        for bx in (1..w.saturating_sub(BLOCK)).step_by(BLOCK) {
-            let (mut sum, mut square, mut usable) = (0.0, 0.0, true);
-            for j in by - 1..=(by + BLOCK).min(h - 1) {
-                for i in bx - 1..=(bx + BLOCK).min(w - 1) {
-                    let v = z.at(i, j);
-                    usable &= v > 0.0 && v < 0.95;
-                }
-            }
-            if !usable || by + BLOCK >= h || bx + BLOCK >= w {
+    for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
+        for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
+            let around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
+            if !around.into_iter().all(|(i, j)| z.at(i, j) > 0.0 && z.at(i, j) < 0.95) {
                 continue;
             }
+            let (mut sum, mut square) = (0.0, 0.0);
             for j in by..by + BLOCK {
                 for i in bx..bx + BLOCK {
-                    let at = |dx: usize, dy: usize| f64::from(x.at(i + dx - 1, j + dy - 1));
+                    let at = |dx: usize, dy: usize| f64::from(x.at(i + dx * lag - lag, j + dy * lag - lag));
                     let corners = at(0, 0) + at(2, 0) + at(0, 2) + at(2, 2);
                     let sides = at(1, 0) + at(0, 1) + at(2, 1) + at(1, 2);
                     square += (corners - 2.0 * sides + 4.0 * at(1, 1)).powi(2) / 36.0;

@@ -21,11 +21,13 @@ pub struct Verdict {
     pub reason: String,
 }
 
-/// Below this share of another frame's fine structure a frame is blurred. A blur of 2 px halves the energy of one-pixel
-/// differences across its direction; noise moves the ratio by a few per cent.
-const DETAIL: f64 = 0.72;
+/// Below this share of another frame's fine structure a frame is blurred: a blur of 2 px halves the energy of one-pixel differences
+/// across its direction. Noise moves the ratio of sharp frames down to 0.7, shaken frames have 0.01 to 0.2.
+const DETAIL: f64 = 0.5;
 /// Below this no edge is steep: even the best frame is blurred.
 const STEEPNESS: f64 = 0.335;
+/// Relative error of the noise level that is taken off the energies.
+const NOISE_ERROR: f64 = 0.2;
 /// Directions in which differences are taken.
 const DIRECTIONS: [(usize, usize, bool); 4] = [(1, 0, false), (0, 1, false), (1, 1, false), (1, 1, true)];
 
@@ -39,19 +41,19 @@ fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
     let clipped = mask::clipped(frame);
     let dt = frame.exposure_time;
     let mean = x.mean();
-    // Below two standard deviations, noise clipped at black is no longer symmetric.
-    let floor = 2.0 * noise.read.sqrt();
+    // Below three standard deviations, noise clipped at black is no longer symmetric.
+    let floor = 3.0 * noise.read.sqrt();
     let valid = mean.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
     let variance = mean.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
     Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid }
 }
 
-/// Noise-free energy of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid in `a` and `b`;
+/// Noise-free energy and its uncertainty (two standard deviations, and the noise level's own error), of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid in `a` and `b`;
 /// weighted by the larger variance of the two, so that both sums of a pair speak of the same pixels in the same way.
 fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: usize) -> (f64, f64) {
     let (w, h) = a.value.size();
     let (dx, dy) = (direction.0 * lag, direction.1 * lag);
-    let (mut sum, mut scatter) = (0.0, 0.0);
+    let (mut sum, mut scatter, mut noise) = (0.0, 0.0, 0.0);
     for y in 0..h.saturating_sub(dy) {
         for x in 0..w.saturating_sub(dx) {
             let (i, j) = if direction.2 { (y * w + x + dx, (y + dy) * w + x) } else { (y * w + x, (y + dy) * w + x + dx) };
@@ -62,11 +64,12 @@ fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: us
             let weight = 1.0 / own.max(f64::from(b.variance.data[i] + b.variance.data[j]));
             let d = f64::from(a.value.data[i] - a.value.data[j]);
             sum += weight * (d * d - own);
+            noise += weight * own;
             // Variance of a squared difference of noise sigma^2: 2 sigma^4 + 4 d^2 sigma^2.
             scatter += weight * weight * (2.0 * own * own + 4.0 * (d * d - own).max(0.0) * own);
         }
     }
-    (sum, scatter.sqrt())
+    (sum, 2.0 * scatter.sqrt() + NOISE_ERROR * noise)
 }
 
 /// Sorts the frames. `given` (from the user) overrides; the numbers are reported all the same.
@@ -78,16 +81,17 @@ pub fn triage(frames: &[Frame], exposures: &[Rgb], noise: &NoiseModel, excluded:
             let mut detail = 1.0f64;
             for &j in used.iter().filter(|&&j| j != i) {
                 for direction in DIRECTIONS {
-                    let ((own, _), (other, error)) = (energy(&all[i], &all[j], direction, 1), energy(&all[j], &all[i], direction, 1));
-                    // Only where the other frame's fine structure stands clear of its noise.
-                    if other > 6.0 * error {
-                        detail = detail.min(own.max(0.0) / other);
+                    let ((own, own_error), (other, error)) =
+                        (energy(&all[i], &all[j], direction, 1), energy(&all[j], &all[i], direction, 1));
+                    // Only where the other frame's fine structure stands clear of its noise, and of this frame's.
+                    if other > 3.0 * error && other > 3.0 * own_error {
+                        detail = detail.min((own + own_error).max(0.0) / other);
                     }
                 }
             }
             let steep = DIRECTIONS.iter().filter_map(|&d| {
                 let ((one, _), (two, error)) = (energy(&all[i], &all[i], d, 1), energy(&all[i], &all[i], d, 2));
-                (two > 6.0 * error).then(|| one.max(0.0) / two)
+                (two > 3.0 * error).then(|| one.max(0.0) / two)
             });
             let steepness = steep.fold(f64::INFINITY, f64::min);
             let steepness = if steepness.is_finite() { steepness } else { 0.5 };

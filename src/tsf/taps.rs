@@ -13,10 +13,11 @@ use std::collections::BTreeMap;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Interpolation {
-    /// Two taps per axis.
+    /// Two taps per axis: the default. With poses refined under the same interpolation it measures as well as the longer kernels (39.5 dB
+    /// against 39.1 dB for bicubic on a 226 x 341 bracket) at half the time.
+    #[default]
     Bilinear,
     /// Four taps per axis: cubic convolution (Keys 1981, a = -1/2).
-    #[default]
     Bicubic,
     /// Six taps per axis: Keys' cubic convolution of fourth order.
     SixPoint,
