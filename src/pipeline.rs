@@ -66,6 +66,8 @@ pub struct Outcome {
 const LARGEST_PAD: f64 = 0.15;
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
+/// Mean squared residual over noise variance from which a blurred frame's TSF is not believed. True TSFs reach 1 to 2, wrong ones tens.
+const HOPELESS: f64 = 8.0;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 5;
 /// Local PSFs per blurred frame.
@@ -214,29 +216,46 @@ impl Run<'_> {
             tsfs[i] = tsf;
             details[i] = detail;
         }
-        let shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
-        let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
-        let mut solution = base;
-        if !shaken.is_empty() {
-            let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
-            for round in 0..rounds {
-                let at = |part: f32| 0.40 + 0.58 * (round as f32 + part) / rounds as f32;
-                if round > 0 {
-                    self.progress("refining the blur", at(0.0))?;
-                    latent = solution.cropped();
-                    for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                        tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
-                    }
+        let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
+        let mut all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
+        let mut solution = None;
+        let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
+        let mut round = 0;
+        while round < rounds && !shaken.is_empty() {
+            let at = |part: f32| 0.40 + 0.58 * (round as f32 + part) / rounds as f32;
+            if round > 0 {
+                self.progress("refining the blur", at(0.0))?;
+                for &i in estimated.iter().filter(|i| shaken.contains(i)) {
+                    tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
-                let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
-                let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
-                let from = latent.map_planes(|p| p.padded(pad));
-                // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
-                let inner = if round + 1 < rounds { self.settings.deblur.inner / 2 } else { self.settings.deblur.inner };
-                let settings = deblur::Settings { inner, ..self.settings.deblur.clone() };
-                solution = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             }
+            let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
+            let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
+            let from = latent.map_planes(|p| p.padded(pad));
+            // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
+            let inner = if round + 1 < rounds { self.settings.deblur.inner / 2 } else { self.settings.deblur.inner };
+            let settings = deblur::Settings { inner, ..self.settings.deblur.clone() };
+            let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
+            let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
+            let hopeless: Vec<(usize, f64)> = shaken.iter().map(|&i| (i, chi(i))).filter(|(_, c)| *c > HOPELESS).collect();
+            if hopeless.is_empty() {
+                latent = solved.cropped();
+                solution = Some(solved);
+                round += 1;
+                continue;
+            }
+            // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
+            for (i, chi) in hopeless {
+                self.warn(format!(
+                    "{}: no camera shake explains it (its residual is {chi:.1} times its noise); it is left out",
+                    frames[i].name
+                ))?;
+                shaken.retain(|&k| k != i);
+                all.retain(|&k| k != i);
+            }
+            solution = None;
         }
+        let solution = solution.unwrap_or(base);
         self.progress("finishing", 0.99)?;
         self.finish(solution, reference, &verdicts, &sharp, &all, &tsfs, details)
     }
