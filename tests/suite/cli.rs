@@ -1,9 +1,14 @@
 //! The program as a user runs it: outputs, messages, exit codes.
 
 use crate::support::files::{Noise, listing, scene, shared, write_png};
+use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output};
 use tempfile::{TempDir, tempdir};
+use unshaken::image::Rgb;
+use unshaken::io::exr;
+use unshaken::synth::{self, Camera, SyntheticBracket, Tremor};
+use unshaken::tsf::TsfFile;
 
 fn unshaken(folder: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_unshaken")).current_dir(folder).args(arguments).output().expect("the program runs")
@@ -39,6 +44,22 @@ fn folder() -> TempDir {
     std::fs::copy(at("a.png"), at("other/a.png")).unwrap();
     let pose = r#"[{"t_x":0,"t_y":0,"weight":1}]"#;
     let entry = format!(r#"{{"frame":"a.png","width":64,"height":48,"focal_px":80,"poses":{pose}}}"#);
+    std::fs::create_dir(at("album")).unwrap();
+    std::fs::copy(at("a.png"), at("album/frame3.png")).unwrap();
+    let wrong = [
+        ("negative", r#""width":64,"height":48,"focal_px":80,"poses":[{"t_x":1,"t_y":0,"weight":2},{"t_x":0,"t_y":0,"weight":-1}]"#),
+        ("weightless", r#""width":64,"height":48,"focal_px":80,"poses":[{"t_x":1,"t_y":0,"weight":0}]"#),
+        ("no-poses", r#""width":64,"height":48,"focal_px":80,"poses":[]"#),
+        ("no-weight", r#""width":64,"height":48,"focal_px":80,"poses":[{"t_x":1,"t_y":0}]"#),
+        ("focal", r#""width":64,"height":48,"focal_px":-80,"poses":[{"t_x":0,"t_y":0,"weight":1}]"#),
+        ("size", r#""width":640,"height":480,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1}]"#),
+    ];
+    for (name, rest) in wrong {
+        let text = format!(r#"{{"format":"unshaken-tsf","version":1,"frames":[{{"frame":"b.png",{rest}}}]}}"#);
+        std::fs::write(at(&format!("{name}.json")), text).unwrap();
+    }
+    std::fs::write(at("version.json"), r#"{"format":"unshaken-tsf","version":2,"frames":[]}"#).unwrap();
+    std::fs::write(at("report.json"), r#"{"format":"unshaken-report","version":1,"frames":[]}"#).unwrap();
     std::fs::write(at("a-tsf.json"), format!(r#"{{"format":"unshaken-tsf","version":1,"frames":[{entry}]}}"#)).unwrap();
     std::fs::write(at("two-tsf.json"), format!(r#"{{"format":"unshaken-tsf","version":1,"frames":[{entry},{entry}]}}"#)).unwrap();
     dir
@@ -124,6 +145,22 @@ fn files_of_another_kind_are_refused() {
 }
 
 #[test]
+fn tsfs_that_cannot_be_are_refused() {
+    assert_refused(&[
+        ("merge -o x.exr --exposures 1,2 --tsf negative.json a.png b.png", 1, &["negative.json", "b.png", "negative weight"]),
+        ("merge -o x.exr --exposures 1,2 --tsf weightless.json a.png b.png", 1, &["weightless.json", "b.png", "positive weight"]),
+        ("merge -o x.exr --exposures 1,2 --tsf no-poses.json a.png b.png", 1, &["no-poses.json", "b.png", "at least one pose"]),
+        ("merge -o x.exr --exposures 1,2 --tsf no-weight.json a.png b.png", 1, &["no-weight.json", "missing field `weight`"]),
+        ("merge -o x.exr --exposures 1,2 --tsf focal.json a.png b.png", 1, &["focal.json", "b.png", "focal length -80"]),
+        ("merge -o x.exr --exposures 1,2 --tsf size.json a.png b.png", 1, &["size.json", "b.png", "640 x 480", "64 x 48"]),
+        ("merge -o x.exr --exposures 1,2 --tsf version.json a.png b.png", 1, &["version.json", "version 2", "version 1"]),
+        ("merge -o x.exr --exposures 1,2 --tsf report.json a.png b.png", 1, &["report.json", "unshaken-tsf"]),
+        ("merge -o x.exr --exposures 1,2 --tsf a.png a.png b.png", 1, &["a.png", "not a text file"]),
+        ("merge -o x.exr --exposures 1,2 --tsf none.json a.png b.png", 1, &["none.json", "cannot be read"]),
+    ]);
+}
+
+#[test]
 fn outputs_are_refused_before_the_work() {
     assert_refused(&[
         ("merge -o there.exr --exposures 1,2 a.png b.png", 1, &["there.exr", "exists", "--overwrite"]),
@@ -132,6 +169,8 @@ fn outputs_are_refused_before_the_work() {
         ("merge -o a.png/x.exr --exposures 1,2 a.png b.png", 1, &["a.png/x.exr", "not a folder"]),
         ("merge -o other --overwrite --exposures 1,2 a.png b.png", 1, &["other", "is a folder"]),
         ("calibrate -o there.exr --exposures 1,2 a.png b.png", 1, &["there.exr", "exists", "--overwrite"]),
+        ("demo --output-dir a.png", 1, &["a.png", "cannot be made", "--output-dir"]),
+        ("demo --output-dir album", 1, &["frame3.png", "not of an earlier demo", "--output-dir"]),
     ]);
     if cfg!(target_os = "linux") {
         assert_refused(&[("merge -o /proc/x.exr --exposures 1,2 a.png b.png", 1, &["/proc/x.exr", "takes no new file"])]);
@@ -173,4 +212,167 @@ fn calibrate_reads_exposure_times_from_exif() {
     arguments.extend(frames.iter().map(String::as_str));
     let out = unshaken(dir.path(), &arguments);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+}
+
+/// Without an adapter the error names a remedy for each system, and nothing is written. The variables hide all drivers
+/// from the loader, which only Linux has.
+#[cfg(target_os = "linux")]
+#[test]
+fn without_an_adapter_the_error_says_what_to_install() {
+    let dir = folder();
+    let before = listing(dir.path());
+    for line in ["merge -o x.exr --exposures 1,2 a.png b.png", "adapters", "demo --output-dir other"] {
+        let out = Command::new(env!("CARGO_BIN_EXE_unshaken"))
+            .current_dir(dir.path())
+            .args(line.split_whitespace())
+            .env("VK_DRIVER_FILES", "/nonexistent")
+            .env("VK_ICD_FILENAMES", "/nonexistent")
+            .output()
+            .expect("the program runs");
+        let text = String::from_utf8_lossy(&out.stderr);
+        assert_eq!(out.status.code(), Some(1), "{line}: {text}");
+        let last = text.lines().last().unwrap_or_default();
+        for word in ["error: no GPU adapter", "Debian/Ubuntu: apt-get install mesa-vulkan-drivers", "Fedora", "Arch", "macOS", "Windows"] {
+            assert!(last.contains(word), "{line}: {last:?} lacks {word:?}");
+        }
+        assert_eq!(listing(dir.path()), before, "{line}");
+        assert_eq!(listing(&dir.path().join("other")), ["a.png"], "{line}");
+    }
+}
+
+const TINY: (usize, usize) = (96, 72);
+
+/// A bracket of [`TINY`] frames (1/30, 1/8 and 1/2 s) in `folder`; `shaken` are blurred by about 7 px.
+fn tiny(folder: &Path, shaken: [bool; 3]) -> SyntheticBracket {
+    let scene = synth::room(TINY.0, TINY.1, 24, 5);
+    let tremor = Tremor { extent_px: 7.0, roll_deg: 0.5, offset_px: 0.5, offset_deg: 0.0 };
+    let times = [1.0 / 30.0, 1.0 / 8.0, 1.0 / 2.0];
+    let frames: Vec<_> = times.into_iter().zip(shaken).map(|(t, s)| (t, s.then(|| tremor.clone()))).collect();
+    let made = synth::capture(&scene, &Camera { full_well: 20000.0, ..Camera::default() }, &frames, 0.2, 5).unwrap();
+    for frame in made.bracket.frames() {
+        let code = |x: u32, y: u32| frame.intensity.pixel(y as usize * TINY.0 + x as usize).map(|v| (255.0 * v).round() as u8);
+        image::RgbImage::from_fn(TINY.0 as u32, TINY.1 as u32, |x, y| image::Rgb(code(x, y))).save(folder.join(&frame.name)).unwrap();
+    }
+    made
+}
+
+/// Merges the tiny bracket in `folder` to `name.exr` and `name.json`: image, factor, report, what was said.
+fn merge_tiny(folder: &Path, name: &str, more: &[&str]) -> (Rgb, Option<f64>, Value, String) {
+    let (image, report) = (format!("{name}.exr"), format!("{name}.json"));
+    let mut arguments = vec!["merge", "--exposures", "1/30,1/8,1/2", "--response", "srgb", "-o", &image, "--report", &report];
+    arguments.extend(more);
+    arguments.extend(["frame1.png", "frame2.png", "frame3.png"]);
+    let out = unshaken(folder, &arguments);
+    let said = format!("{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+    assert_eq!(out.status.code(), Some(0), "{more:?}: {said}");
+    let (pixels, factor) = exr::read(&folder.join(&image)).unwrap();
+    assert_eq!(pixels.size(), TINY);
+    assert!(pixels.0.iter().all(|p| p.data.iter().all(|v| v.is_finite() && *v >= 0.0)), "{more:?}");
+    let report = serde_json::from_str(&std::fs::read_to_string(folder.join(&report)).unwrap()).unwrap();
+    (pixels, factor, report, said)
+}
+
+/// Root mean square difference of log irradiance (natural), `a` scaled by `gain`.
+fn log_difference(a: &Rgb, b: &Rgb, gain: f32) -> f64 {
+    let squares =
+        a.0.iter()
+            .zip(&b.0)
+            .flat_map(|(a, b)| a.data.iter().zip(&b.data).map(|(a, b)| f64::from(((a * gain).max(1e-4) / b.max(1e-4)).ln()).powi(2)));
+    let squares: Vec<f64> = squares.collect();
+    (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+}
+
+fn column<'a>(report: &'a Value, field: &str) -> Vec<&'a Value> {
+    report["frames"].as_array().unwrap().iter().map(|f| &f[field]).collect()
+}
+
+#[test]
+fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
+    let dir = tempdir().unwrap();
+    let truth = tiny(dir.path(), [false, false, true]);
+    let (image, factor, report, said) = merge_tiny(dir.path(), "first", &["--preview", "first.png"]);
+    assert!(said.starts_with("wrote first.exr (96 x 72; 1.0 is the white of frame 2, frame2.png, at 0.125 s)"), "{said}");
+    assert!(!said.contains("warning"), "{said}");
+    assert_eq!(factor, Some(0.125));
+    let off = log_difference(&image, &truth.truth.map_planes(|p| p.map(|v| v * 0.125)), 1.0);
+    assert!(off < 0.25, "log irradiance is off by {off:.3}");
+    let preview = image::open(dir.path().join("first.png")).unwrap().into_rgb8();
+    assert_eq!(preview.dimensions(), (96, 72));
+    let shades = preview.pixels().map(|p| p.0[1]);
+    assert!(shades.clone().max() > Some(150) && shades.min() < Some(60), "the preview shows lights and shadows");
+
+    assert_eq!((&report["format"], &report["version"]), (&json!("unshaken-report"), &json!(1)));
+    assert_eq!((&report["reference"], &report["size"]), (&json!("frame2.png"), &json!([96, 72])));
+    assert!(report["adapter"].as_str().is_some_and(|a| !a.is_empty()));
+    assert!(report["timings_s"].as_array().is_some_and(|t| !t.is_empty()));
+    assert!(report["solver"]["history"].as_array().is_some_and(|t| !t.is_empty()));
+    assert_eq!(column(&report, "frame"), ["frame1.png", "frame2.png", "frame3.png"]);
+    assert_eq!(column(&report, "exposure_time_s"), [1.0 / 30.0, 0.125, 0.5]);
+    assert_eq!(column(&report, "sharp"), [true, true, false]);
+    assert_eq!(column(&report, "used"), [true; 3]);
+    assert!(column(&report, "triage").iter().all(|t| t["reason"].as_str().is_some_and(|r| !r.is_empty())));
+    let fit: Vec<f64> = column(&report, "chi_squared").iter().map(|v| v.as_f64().unwrap()).collect();
+    assert!(fit.iter().all(|v| (0.2..5.0).contains(v)), "chi squared per pixel {fit:?}");
+    let patches = report["frames"][2]["blur"]["patches"].as_array().unwrap();
+    assert!(!patches.is_empty());
+    for p in patches {
+        let values: Vec<f64> = serde_json::from_value(p["psf"]["values"].clone()).unwrap();
+        let side = 2 * p["psf"]["radius"].as_u64().unwrap() as usize + 1;
+        assert!(values.len() == side * side && values.iter().all(|v| *v >= 0.0) && p["size"].as_u64() > Some(0));
+    }
+    let entries = column(&report, "tsf");
+    let poses = entries[2]["poses"].as_array().unwrap();
+    let sum: f64 = poses.iter().map(|p| p["weight"].as_f64().unwrap()).sum();
+    assert!(poses.len() > 1 && (sum - 1.0).abs() < 1e-6, "{} poses, weights sum to {sum}", poses.len());
+
+    // The report's TSFs are entries of a TSF file.
+    let file = json!({ "format": "unshaken-tsf", "version": 1, "frames": entries });
+    TsfFile::parse(&file.to_string()).unwrap();
+    std::fs::write(dir.path().join("tsf.json"), file.to_string()).unwrap();
+    let (again, _, second, _) = merge_tiny(dir.path(), "second", &["--tsf", "tsf.json"]);
+    assert_eq!(column(&second, "tsf"), entries);
+    assert_eq!(column(&second, "sharp"), [true, true, false]);
+    assert!(column(&second, "blur")[2].is_null(), "nothing is estimated");
+    let off = log_difference(&again, &image, 1.0);
+    assert!(off < 0.05, "with the same TSFs log irradiance differs by {off:.3}");
+
+    // Another reference: the same irradiance in another frame's whites, up to rounding.
+    let (other, factor, report, said) = merge_tiny(dir.path(), "third", &["--tsf", "tsf.json", "--reference", "1"]);
+    assert!(said.contains("the white of frame 1, frame1.png") && report["reference"] == "frame1.png", "{said}");
+    assert!((factor.unwrap() - 1.0 / 30.0).abs() < 1e-8);
+    let off = log_difference(&other, &again, 30.0 / 8.0);
+    assert!(off < 0.01, "log irradiance differs by {off:.4}");
+}
+
+#[test]
+fn frames_are_left_out_or_taken_as_sharp_as_told() {
+    let dir = tempdir().unwrap();
+    let truth = tiny(dir.path(), [false, false, true]).truth;
+    let (without, _, report, _) = merge_tiny(dir.path(), "without", &["--exclude", "3"]);
+    assert_eq!(column(&report, "used"), [true, true, false]);
+    assert!(report["frames"][2]["chi_squared"].is_null() && report["reference"] == "frame2.png");
+    let off = log_difference(&without, &truth, 1.0 / 0.125);
+    assert!(off < 0.3, "two sharp frames: log irradiance is off by {off:.3}");
+
+    // The blurred frame taken as sharp becomes the reference and blurs the result.
+    let (blurred, factor, report, _) = merge_tiny(dir.path(), "blurred", &["--sharp", "1,2,3"]);
+    assert_eq!(column(&report, "sharp"), [true; 3]);
+    assert_eq!(column(&report, "triage")[2]["reason"], "sharp by option");
+    assert!(factor == Some(0.5) && report["reference"] == "frame3.png");
+    let worse = log_difference(&blurred, &truth, 1.0 / 0.5);
+    assert!(worse > 1.2 * off, "blurred {worse:.3}, sharp {off:.3}");
+
+    let (_, factor, report, said) = merge_tiny(dir.path(), "one", &["--exclude", "1,3"]);
+    assert_eq!(column(&report, "used"), [false, true, false]);
+    assert!(factor == Some(0.125) && said.contains("warning: --exclude leaves one frame"), "{said}");
+}
+
+#[test]
+fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
+    let dir = tempdir().unwrap();
+    tiny(dir.path(), [true; 3]);
+    let (_, _, report, said) = merge_tiny(dir.path(), "blind", &[]);
+    assert!(said.lines().any(|l| l.starts_with("warning:") && l.contains("no frame is sharp")), "{said}");
+    assert_eq!(column(&report, "used"), [true; 3]);
+    assert!(column(&report, "triage").iter().all(|t| t["sharp"] == false), "{:?}", column(&report, "triage"));
 }
