@@ -234,7 +234,9 @@ impl Run<'_> {
             let from = latent.map_planes(|p| p.padded(pad));
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let inner = if round + 1 < rounds { self.settings.deblur.inner / 2 } else { self.settings.deblur.inner };
-            let settings = deblur::Settings { inner, ..self.settings.deblur.clone() };
+            // Without a sharp frame there is no good start, and the first steps are spent on finding one.
+            let outer = self.settings.deblur.outer * if still.is_empty() { 3 } else { 1 };
+            let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
             let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
             let hopeless: Vec<(usize, f64)> = shaken.iter().map(|&i| (i, chi(i))).filter(|(_, c)| *c > HOPELESS).collect();
