@@ -66,8 +66,11 @@ pub struct Outcome {
 const LARGEST_PAD: f64 = 0.15;
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
-/// Mean squared residual over noise variance from which a blurred frame's TSF is not believed. True TSFs reach 1 to 2, wrong ones tens.
+/// Mean squared residual over noise variance up to which a blurred frame is believed whatever else holds: true TSFs reach 1 to 2 on noisy
+/// frames, more on clean ones, where the interpolation's own error shows.
 const HOPELESS: f64 = 8.0;
+/// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
+const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 5;
 /// Local PSFs per blurred frame.
@@ -218,6 +221,7 @@ impl Run<'_> {
         }
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
         let mut all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
+        let start = latent.clone();
         let mut solution = None;
         let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
         let mut round = 0;
@@ -239,7 +243,15 @@ impl Run<'_> {
             let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
             let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
-            let hopeless: Vec<(usize, f64)> = shaken.iter().map(|&i| (i, chi(i))).filter(|(_, c)| *c > HOPELESS).collect();
+            let hopeless: Vec<(usize, f64)> = shaken
+                .iter()
+                .map(|&i| (i, chi(i)))
+                .filter(|&(i, c)| {
+                    c > HOPELESS
+                        && c > UNEXPLAINED
+                            * merge::misfit(&start, &self.exposures[i], &self.masks[i], &self.curves[i], frames[i].exposure_time)
+                })
+                .collect();
             if hopeless.is_empty() {
                 latent = solved.cropped();
                 solution = Some(solved);

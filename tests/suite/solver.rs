@@ -86,7 +86,7 @@ fn start(pad: usize) -> Rgb {
 }
 
 fn settings() -> Settings {
-    Settings { lambda: 2.0, epsilon: 0.05, interpolation: INTERPOLATION, ..Settings::default() }
+    Settings { lambda: 2.0, epsilon: 0.05, robust_after: 0, interpolation: INTERPOLATION, ..Settings::default() }
 }
 
 fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Settings) -> Solution {
