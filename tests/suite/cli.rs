@@ -242,15 +242,15 @@ fn without_an_adapter_the_error_says_what_to_install() {
 
 const TINY: (usize, usize) = (96, 72);
 
-/// A bracket of [`TINY`] frames (1/30, 1/8 and 1/2 s) in `folder`, `shaken` ones blurred by about 7 px; returns the true
+/// A bracket of [`TINY`] frames (1/30, 1/8 and 1/2 s) in `folder`, blurred over `extents` (0 is sharp); returns the true
 /// irradiance. A part of a larger scene, because the room drawn as small as that has no detail that a pixel resolves; without lamps,
 /// and without roll, which would turn round another centre. `median`: luminance, white being 1 after 1 s.
-fn tiny(folder: &Path, shaken: [bool; 3], median: f64) -> Rgb {
+fn tiny(folder: &Path, extents: [f64; 3], median: f64) -> Rgb {
     let (width, height) = (3 * TINY.0, 3 * TINY.1);
     let scene = synth::room(width, height, 24, 5);
-    let tremor = Tremor { extent_px: 7.0, roll_deg: 0.0, offset_px: 0.5, offset_deg: 0.0 };
+    let tremor = |extent_px| Tremor { extent_px, roll_deg: 0.0, offset_px: 0.5, offset_deg: 0.0 };
     let times = [1.0 / 30.0, 1.0 / 8.0, 1.0 / 2.0];
-    let frames: Vec<_> = times.into_iter().zip(shaken).map(|(t, s)| (t, s.then(|| tremor.clone()))).collect();
+    let frames: Vec<_> = times.into_iter().zip(extents).map(|(t, e)| (t, (e > 0.0).then(|| tremor(e)))).collect();
     let made = synth::capture(&scene, &Camera { full_well: 10000.0, ..Camera::default() }, &frames, median, 5).unwrap();
     let part = |p: &Plane| Plane::from_fn(TINY.0, TINY.1, |x, y| p.at(x + 9, y + 140));
     for frame in made.bracket.frames() {
@@ -294,7 +294,7 @@ fn column<'a>(report: &'a Value, field: &str) -> Vec<&'a Value> {
 #[test]
 fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
     let dir = tempdir().unwrap();
-    let truth = tiny(dir.path(), [false, false, true], 0.4);
+    let truth = tiny(dir.path(), [0.0, 0.0, 7.0], 0.4);
     let (image, factor, report, said) = merge_tiny(dir.path(), "first", &["--preview", "first.png"]);
     assert!(said.starts_with("wrote first.exr (96 x 72; 1.0 is the white of frame 2, frame2.png, at 0.125 s)"), "{said}");
     assert!(!said.contains("warning"), "{said}");
@@ -355,7 +355,7 @@ fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
 #[test]
 fn frames_are_left_out_or_taken_as_sharp_as_told() {
     let dir = tempdir().unwrap();
-    let truth = tiny(dir.path(), [false, false, true], 0.4);
+    let truth = tiny(dir.path(), [0.0, 0.0, 7.0], 0.4);
     let (without, _, report, _) = merge_tiny(dir.path(), "without", &["--exclude", "3"]);
     assert_eq!(column(&report, "used"), [true, true, false]);
     assert!(report["frames"][2]["chi_squared"].is_null() && report["reference"] == "frame2.png");
@@ -379,7 +379,7 @@ fn frames_are_left_out_or_taken_as_sharp_as_told() {
 fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
     let dir = tempdir().unwrap();
     // Bright, or the shortest frame's blur is lost in its noise.
-    tiny(dir.path(), [true; 3], 1.5);
+    tiny(dir.path(), [14.0; 3], 1.5);
     let (_, _, report, said) = merge_tiny(dir.path(), "blind", &[]);
     assert!(said.lines().any(|l| l.starts_with("warning:") && l.contains("no frame is sharp")), "{said}");
     assert_eq!(column(&report, "used"), [true; 3]);
