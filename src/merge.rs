@@ -51,11 +51,11 @@ pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: 
 /// Mean squared difference over noise variance of a frame's exposure from what `irradiance`, unblurred, predicts, where it is not masked.
 pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64) -> f64 {
     let (mut sum, mut count) = (0.0f64, 0.0f64);
-    for c in 0..3 {
+    for (c, curve) in curves.iter().enumerate() {
         for (p, e) in irradiance.0[c].data.iter().enumerate().filter(|(p, _)| mask.data[*p] > 0.0) {
             let expected = e * exposure_time as f32;
             let k = ((expected.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1);
-            sum += f64::from((exposure.0[c].data[p] - expected) / curves[c][k]).powi(2);
+            sum += f64::from((exposure.0[c].data[p] - expected) / curve[k]).powi(2);
             count += 1.0;
         }
     }
