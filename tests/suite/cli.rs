@@ -5,6 +5,8 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output};
 use tempfile::{TempDir, tempdir};
+use unshaken::baseline;
+use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
 use unshaken::io::exr;
 use unshaken::synth::{self, Camera, Tremor};
@@ -384,4 +386,40 @@ fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
     assert!(said.lines().any(|l| l.starts_with("warning:") && l.contains("no frame is sharp")), "{said}");
     assert_eq!(column(&report, "used"), [true; 3]);
     assert!(column(&report, "triage").iter().all(|t| t["sharp"] == false), "{:?}", column(&report, "triage"));
+}
+
+/// Camera files, their own curve: window and desk of the office, at half size to be quick.
+#[test]
+fn office_is_calibrated_and_merged() {
+    let Some(office) = shared("data/brackets/office") else { return };
+    let dir = tempdir().unwrap();
+    let names: Vec<_> = (1..=6).map(|i| format!("office_{i}.png")).collect();
+    for name in &names {
+        let picture = image::open(office.join(name).with_extension("jpg")).unwrap().into_rgb8();
+        let half = image::imageops::thumbnail(&picture, picture.width() / 2, picture.height() / 2);
+        image::imageops::crop_imm(&half, 130, 60, 200, 150).to_image().save(dir.path().join(name)).unwrap();
+    }
+    let run = |arguments: &[&str]| {
+        let out = unshaken(dir.path(), &[arguments, &names.iter().map(String::as_str).collect::<Vec<_>>()].concat());
+        assert!(out.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&out.stderr));
+        String::from_utf8_lossy(&out.stderr).into_owned()
+    };
+    let times = ["--exposures", "1/30,0.1,1/3,0.625,1.3,4"];
+    run(&[&["calibrate", "-o", "r.json"], &times[..]].concat());
+    let said = run(&[&["merge", "--response", "r.json", "-o", "o.exr", "--preview", "o.png"], &times[..]].concat());
+    assert!(!said.contains("warning"), "{said}");
+    assert_eq!(image::open(dir.path().join("o.png")).unwrap().into_rgb8().dimensions(), (200, 150));
+
+    // The weighted mean of what the calibrated curve makes of the frames, where one of them is well exposed.
+    let text = std::fs::read_to_string(dir.path().join("r.json")).unwrap();
+    let response = unshaken::response::ResponseFile::parse(&text).unwrap().response();
+    let seconds = [1.0 / 30.0, 0.1, 1.0 / 3.0, 0.625, 1.3, 4.0];
+    let frames = names.iter().zip(seconds).map(|(name, exposure_time)| {
+        let p = unshaken::io::ldr::read(&dir.path().join(name)).unwrap();
+        Frame { name: name.clone(), intensity: p.intensity, levels: p.levels, exposure_time }
+    });
+    let plain = baseline::merge(&Bracket::new(frames.collect()).unwrap(), &response, &[0, 1, 2, 3, 4, 5]);
+    let (image, factor) = exr::read(&dir.path().join("o.exr")).unwrap();
+    let off = log_difference(&image, &plain, 1.0 / factor.unwrap() as f32);
+    assert!(off < 0.15, "log irradiance differs from the plain merge by {off:.3}");
 }
