@@ -72,7 +72,7 @@ const HOPELESS: f64 = 8.0;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
-const SHARP_OUTER: usize = 5;
+const SHARP_OUTER: usize = 3;
 /// Local PSFs per blurred frame.
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
@@ -237,7 +237,7 @@ impl Run<'_> {
             let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
             let from = latent.map_planes(|p| p.padded(pad));
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
-            let inner = if round + 1 < rounds { self.settings.deblur.inner / 2 } else { self.settings.deblur.inner };
+            let inner = if round + 1 < rounds { self.settings.deblur.inner * 3 / 8 } else { self.settings.deblur.inner };
             // Without a sharp frame there is no good start, and the first steps are spent on finding one.
             let outer = self.settings.deblur.outer * if still.is_empty() { 3 } else { 1 };
             let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
