@@ -28,6 +28,8 @@ mod response;
 mod shaders;
 /// The solver against dense algebra, and what it promises.
 mod solver;
+/// Noise, masks, PSFs, TSFs and triage on input whose answer is planted.
+mod stages;
 /// Synthetic brackets against the physics that they claim.
 mod synth;
 /// Tone mapping: degenerate images, shadows and highlights together, no halos.
