@@ -193,8 +193,8 @@ fn the_whole_frame_gives_the_tsf_on_the_grid_and_between() {
     let grid = PoseGrid::new(SIZE.0, SIZE.1, 8, 1.5, 1.0);
     let weight = Plane::filled(SIZE.0, SIZE.1, 1e5);
     for (name, truth, limit) in [
-        ("on the grid", planted(&[(0.0, 0.0, 0.0, 0.5), (2.0, 1.0, 0.0, 0.3), (5.0, -2.0, 0.0, 0.2)]), 0.03),
-        ("between", planted(&[(0.3, -0.4, 0.1, 0.3), (1.4, 0.7, 0.3, 0.3), (2.6, 1.5, 0.55, 0.2), (3.5, 2.4, 0.8, 0.2)]), 0.12),
+        ("on the grid", planted(&[(0.0, 0.0, 0.0, 0.5), (2.0, 1.0, 0.0, 0.3), (5.0, -2.0, 0.0, 0.2)]), 3e-4),
+        ("between", planted(&[(0.3, -0.4, 0.1, 0.3), (1.4, 0.7, 0.3, 0.3), (2.6, 1.5, 0.55, 0.2), (3.5, 2.4, 0.8, 0.2)]), 0.05),
     ] {
         let blurred = blur(&latent, pad, &truth, SIZE);
         let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight };
