@@ -28,6 +28,8 @@ const CELL: (u32, u32) = (400, 300);
 /// Space between cells and height of a label's capitals, pixels.
 const GAP: u32 = 8;
 const LABEL: u32 = 15;
+/// Quality of the picture as JPEG: below 400 kB, so that a web page can show it (as PNG it is 2 MB, of noise).
+pub const JPEG_QUALITY: u8 = 80;
 /// Upper left corners of the close-ups, for frames of [`SIZE`]; each shows [`CELL`] / 3.
 const CLOSE_UPS: [(u32, u32); 2] = [(372, 86), (16, 272)];
 
@@ -75,6 +77,7 @@ pub fn run(output_dir: &Path, events: &mut dyn FnMut(Event) -> bool) -> anyhow::
 
     let shaken = as_taken(&frames[frames.len() - 1], &response, &synthetic.truth);
     let columns = [("SHAKEN, 2 S", &shaken), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp_only), ("UNSHAKEN", &unshaken)];
+    let picture = comparison(&columns, &ToneMap::fit(&unshaken));
     let mut report = outcome.report;
     if let Some(fields) = report.as_object_mut() {
         let [plain, sharp_only, unshaken] = &scores;
@@ -83,7 +86,8 @@ pub fn run(output_dir: &Path, events: &mut dyn FnMut(Event) -> bool) -> anyhow::
     let mut staged = vec![
         // The first to be renamed: by it a later demo knows the folder.
         targets.report.stage_json(&report)?,
-        targets.picture.stage_png(&comparison(&columns, &ToneMap::fit(&unshaken)))?,
+        targets.picture.stage_png(&picture)?,
+        targets.small.stage_jpeg(&picture, JPEG_QUALITY)?,
         targets.unshaken.stage_exr(&outcome.irradiance, &radiometry)?,
         targets.truth.stage_exr(&truth, &radiometry)?,
         targets.true_tsfs.stage_json(&true_tsfs(&synthetic))?,
@@ -104,6 +108,7 @@ const MARK: &str = "demo";
 struct Targets {
     report: Output,
     picture: Output,
+    small: Output,
     unshaken: Output,
     truth: Output,
     true_tsfs: Output,
@@ -126,6 +131,7 @@ fn targets(folder: &Path) -> anyhow::Result<Targets> {
     Ok(Targets {
         report: at(REPORT)?,
         picture: at("before-after.png")?,
+        small: at("before-after.jpg")?,
         unshaken: at("unshaken.exr")?,
         truth: at("truth.exr")?,
         true_tsfs: at("truth_tsf.json")?,
@@ -150,6 +156,7 @@ fn summary([plain, sharp_only, unshaken]: &[Score; 3], targets: &Targets) -> Str
         unshaken.pu_psnr - sharp_only.pu_psnr
     );
     text += &file(&targets.picture, "before and after: look at this first");
+    text += &file(&targets.small, "the same, smaller");
     text += &file(&targets.unshaken, "the result, linear");
     text += &file(&targets.report, "everything that was estimated");
     text += &file(first, &format!("to {}: the frames", last.path().file_name().unwrap_or_default().display()));

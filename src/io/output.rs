@@ -94,6 +94,17 @@ impl Output {
         })
     }
 
+    /// Stages a JPEG of `quality` 1..=100, for pictures that noise makes large as PNG.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_jpeg(&self, picture: &::image::RgbImage, quality: u8) -> Result<Staged> {
+        self.stage(|to| {
+            let encoder = ::image::codecs::jpeg::JpegEncoder::new_with_quality(to, quality);
+            picture.write_with_encoder(encoder).map_err(|e| e.to_string())
+        })
+    }
+
     fn folder(&self) -> &Path {
         match self.path.parent() {
             Some(p) if !p.as_os_str().is_empty() => p,

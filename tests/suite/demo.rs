@@ -2,6 +2,7 @@
 
 use unshaken::baseline;
 use unshaken::cli::demo;
+use unshaken::io::output::Output;
 use unshaken::metrics::{Judge, score};
 use unshaken::response::Response;
 use unshaken::tonemap::ToneMap;
@@ -23,8 +24,18 @@ fn the_bracket_is_one_that_deblurring_helps() {
 
     let shaken = demo::as_taken(&s.bracket.frames()[4], &Response::Srgb, &s.truth);
     let map = ToneMap::fit(&s.truth);
-    let picture = demo::comparison(&[("SHAKEN, 2 S", &shaken), ("UNSHAKEN", &s.truth)], &map);
-    assert!(picture.width() > 800 && picture.height() > 900);
+    let merged = |frames: &[usize]| baseline::merge(&s.bracket, &Response::Srgb, frames);
+    let (plain, sharp) = (merged(&[0, 1, 2, 3, 4]), merged(&[0, 1, 2]));
+    let columns = [("SHAKEN, 2 S", &shaken), ("ALL FRAMES MERGED", &plain), ("SHARP FRAMES ONLY", &sharp), ("UNSHAKEN", &s.truth)];
+    let picture = demo::comparison(&columns, &map);
+    assert!(picture.width() > 1600 && picture.height() > 900);
+    // What the README shows: small enough for a web page, and readable.
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("before-after.jpg");
+    Output::check(&path, false).unwrap().stage_jpeg(&picture, demo::JPEG_QUALITY).unwrap().commit().unwrap();
+    let bytes = std::fs::metadata(&path).unwrap().len();
+    assert!((100_000..400_000).contains(&bytes), "{bytes} bytes");
+    assert_eq!(image::open(&path).unwrap().into_rgb8().dimensions(), picture.dimensions());
     let label = picture.enumerate_pixels().filter(|(_, y, p)| *y < 28 && p.0[0] > 200).count();
     assert!(label > 300, "labels are drawn: {label} light pixels");
 }
