@@ -73,7 +73,7 @@ fn the_noise_level_is_found_within_a_fifth() {
             (0..12).map(|k| numbers(100 + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
         let value = |x: usize, y: usize| {
             let level = 0.01 + 0.8 * ((x / 16) as f64 / 16.0).powi(2);
-            if (y / 64) % 2 == 1 { level * if (x + y) % 2 == 0 { 0.8 } else { 1.1 } } else { level }
+            if (y / 64) % 2 == 1 { level * if (x + y).is_multiple_of(2) { 0.8 } else { 1.1 } } else { level }
         };
         // Sum of twelve uniforms of variance 1/3: standard normal times 2.
         let plane = Plane::from_fn(w, h, |x, y| {
