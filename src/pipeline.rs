@@ -243,8 +243,10 @@ impl Run<'_> {
             let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
             let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
-            let hopeless: Vec<(usize, f64)> = shaken
+            // TSFs that the user gave are believed.
+            let hopeless: Vec<(usize, f64)> = estimated
                 .iter()
+                .filter(|i| shaken.contains(i))
                 .map(|&i| (i, chi(i)))
                 .filter(|&(i, c)| {
                     c > HOPELESS

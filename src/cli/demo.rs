@@ -41,7 +41,7 @@ const CLOSE_UPS: [(u32, u32); 2] = [(372, 86), (16, 272)];
 pub fn bracket() -> crate::error::Result<SyntheticBracket> {
     let scene = synth::room(SIZE.0, SIZE.1, MARGIN, SEED);
     let shaken = |extent_px, roll_deg| Some(Tremor { extent_px, roll_deg, offset_px: 1.5, offset_deg: 0.1 });
-    let frames = [(1.0 / 30.0, None), (1.0 / 8.0, None), (1.0 / 5.0, None), (1.0 / 2.0, shaken(7.0, 0.6)), (2.0, shaken(11.0, 0.9))];
+    let frames = [(1.0 / 30.0, None), (1.0 / 8.0, None), (1.0 / 5.0, None), (1.0 / 2.0, shaken(6.0, 0.5)), (2.0, shaken(9.0, 0.8))];
     synth::capture(&scene, &Camera::default(), &frames, MEDIAN, SEED)
 }
 
