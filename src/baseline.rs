@@ -13,9 +13,8 @@ use crate::response::Response;
 /// When `frames` is empty or names a frame that the bracket does not have.
 pub fn merge(bracket: &Bracket, response: &Response, frames: &[usize]) -> Rgb {
     let chosen: Vec<_> = frames.iter().map(|&i| &bracket.frames()[i]).collect();
-    let by_time = |a: &&usize, b: &&usize| bracket.frames()[**a].exposure_time.total_cmp(&bracket.frames()[**b].exposure_time);
-    let shortest = *frames.iter().min_by(by_time).expect("frames to merge");
-    let longest = *frames.iter().max_by(by_time).expect("frames to merge");
+    let shortest = bracket.shortest(frames).expect("frames to merge");
+    let longest = bracket.longest(frames).expect("frames to merge");
     let (width, height) = bracket.size();
     let mut out = Rgb(std::array::from_fn(|_| Plane::filled(width, height, 0.0)));
     for i in 0..width * height {

@@ -77,6 +77,16 @@ impl Bracket {
         &self.frames
     }
 
+    /// The frame of `ids` with the shortest exposure time; `None` for no ids.
+    pub fn shortest(&self, ids: &[usize]) -> Option<usize> {
+        ids.iter().copied().min_by(|&a, &b| self.frames[a].exposure_time.total_cmp(&self.frames[b].exposure_time))
+    }
+
+    /// The frame of `ids` with the longest exposure time; `None` for no ids.
+    pub fn longest(&self, ids: &[usize]) -> Option<usize> {
+        ids.iter().copied().max_by(|&a, &b| self.frames[a].exposure_time.total_cmp(&self.frames[b].exposure_time))
+    }
+
     /// (width, height) of every frame.
     pub fn size(&self) -> (usize, usize) {
         self.frames[0].intensity.size()

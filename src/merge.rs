@@ -10,7 +10,7 @@ use crate::mask;
 pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves: &[[Vec<f32>; 3]], ids: &[usize]) -> Rgb {
     let (w, h) = bracket.size();
     let frames = bracket.frames();
-    let shortest = ids.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)).unwrap_or(0);
+    let shortest = bracket.shortest(ids).unwrap_or(0);
     let longest = ids.iter().map(|&i| frames[i].exposure_time).fold(0.0, f64::max) as f32;
     Rgb(std::array::from_fn(|c| {
         let smooth: Vec<Plane> = ids.iter().map(|&i| box_mean(&exposures[i].0[c], 2)).collect();
@@ -21,9 +21,9 @@ pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves:
             let (mut num, mut den) = (0.0f64, 0.0f64);
             for (s, &i) in smooth.iter().zip(ids) {
                 let dt = frames[i].exposure_time as f32;
-                let k = ((s.data[p].clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1);
+                let noise = noise_at(&curves[i][c], s.data[p]);
                 let m = masks[i].data[p];
-                let weight = f64::from(m * m * dt * dt / (curves[i][c][k] * curves[i][c][k]));
+                let weight = f64::from(m * m * dt * dt / (noise * noise));
                 num += weight * f64::from(exposures[i].0[c].data[p] / dt);
                 den += weight;
             }
@@ -37,7 +37,7 @@ pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves:
 /// Raises pixels that the shortest of the frames `ids` has clipped to the irradiance that clips it: the best lower bound there is.
 pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: &[Rgb], ids: &[usize]) {
     let frames = bracket.frames();
-    let Some(shortest) = ids.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)) else { return };
+    let Some(shortest) = bracket.shortest(ids) else { return };
     for c in 0..3 {
         let z = &frames[shortest].intensity.0[c];
         for (p, v) in irradiance.0[c].data.iter_mut().enumerate() {
@@ -54,12 +54,16 @@ pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>
     for (c, curve) in curves.iter().enumerate() {
         for (p, e) in irradiance.0[c].data.iter().enumerate().filter(|(p, _)| mask.data[*p] > 0.0) {
             let expected = e * exposure_time as f32;
-            let k = ((expected.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1);
-            sum += f64::from((exposure.0[c].data[p] - expected) / curve[k]).powi(2);
+            sum += f64::from((exposure.0[c].data[p] - expected) / noise_at(curve, expected)).powi(2);
             count += 1.0;
         }
     }
     if count > 0.0 { sum / count } else { 0.0 }
+}
+
+/// Noise of the exposure `x` from its curve: the sample below.
+fn noise_at(curve: &[f32], x: f32) -> f32 {
+    curve[((x.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1)]
 }
 
 /// Mean over squares of side 2 r + 1, edge pixels repeated.

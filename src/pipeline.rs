@@ -181,16 +181,11 @@ impl Run<'_> {
                 tsfs[i] = Some(Tsf::identity());
             }
         }
-        let reference = self.settings.reference.unwrap_or_else(|| {
-            let longest = |ids: Vec<usize>| ids.into_iter().max_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time));
-            let sharps = used.iter().copied().filter(|&i| sharp[i]).collect();
-            longest(sharps)
-                .or_else(|| used.iter().copied().min_by(|&a, &b| frames[a].exposure_time.total_cmp(&frames[b].exposure_time)))
-                .unwrap_or(0)
-        });
-        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32);
         let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
+        let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
+        let reference = self.settings.reference.or(found).unwrap_or(0);
+        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32);
         let mut details: Vec<Value> = vec![Value::Null; frames.len()];
 
         // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
