@@ -73,6 +73,8 @@ const HOPELESS: f64 = 8.0;
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 3;
+/// Outer iterations of the rounds before the last.
+const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
@@ -232,10 +234,11 @@ impl Run<'_> {
             let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
             let from = latent.map_planes(|p| p.padded(pad));
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
-            let inner = if round + 1 < rounds { self.settings.deblur.inner * 3 / 8 } else { self.settings.deblur.inner };
-            // Without a sharp frame there is no good start, and the first steps are spent on finding one.
-            let outer = self.settings.deblur.outer * if still.is_empty() { 3 } else { 1 };
-            let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
+            let settings = if round + 1 < rounds {
+                deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() }
+            } else {
+                self.settings.deblur.clone()
+            };
             let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
             // TSFs that the user gave are believed.

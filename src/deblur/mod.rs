@@ -7,9 +7,14 @@
 //!
 //! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
 //!
-//! then tries u + clamp(s·δu, ±1) for s = 1, 1/2, 1/4, ... until the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with
-//! these weights) does not rise. λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
-//! The iteration stops when an outer step lowers the objective by less than `tolerance` of it, or at `outer` steps.
+//! then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu) elsewhere (at most fourfold, at least 1/e) for s = 1, 1/2, 1/4, ... until
+//! the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with these weights) does not rise. The data term is quadratic in E: with
+//! the first form a bracket without a sharp frame needs half the outer iterations that exp(s·δu) in both directions needs.
+//! λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
+//!
+//! Residuals far from the solution speak of the start and not of a frame's TSF, so the residual-driven weights begin once
+//! an outer step lowers the objective by less than `settled` of it. The iteration stops when a step under these weights lowers
+//! it by less than `tolerance` of it, or at `outer` steps.
 
 use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
@@ -53,8 +58,8 @@ pub struct Settings {
     pub tolerance: f64,
     /// Strength of the residual-driven weights of blurred frames; 0: none.
     pub robust: f32,
-    /// Outer iterations before the residual-driven weights: at the start residuals speak of the start, not of the frame.
-    pub robust_after: usize,
+    /// Relative fall of the objective in an outer step below which the residual-driven weights begin; infinity: from the first.
+    pub settled: f64,
     /// Whether data weights follow the estimate; `false` freezes those of the start.
     pub reweight: bool,
     /// Interpolation of the warps.
@@ -64,13 +69,13 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            lambda: 3.0,
+            lambda: 2.5,
             epsilon: 0.01,
-            outer: 2,
+            outer: 8,
             inner: 16,
-            tolerance: 1e-4,
+            tolerance: 1e-2,
             robust: 1.0,
-            robust_after: 1,
+            settled: 0.6,
             reweight: true,
             interpolation: Interpolation::default(),
         }
@@ -518,9 +523,10 @@ impl<'a> Solver<'a> {
         let keep: Vec<Step> = (0..3).map(|c| Step::Copy(s.log[c].clone(), s.old[c].clone())).collect();
         let mut history = Vec::new();
         let mut stop = Stop::IterationLimit;
+        let mut settled = set.robust == 0.0 || set.settled == f64::INFINITY;
         for outer in 0..set.outer {
             if outer == 0 || set.reweight {
-                self.gpu.submit(if outer < set.robust_after { &trusting } else { &weigh });
+                self.gpu.submit(if settled { &weigh } else { &trusting });
             }
             self.gpu.submit(&residuals);
             self.gpu.submit(&edges);
@@ -555,10 +561,11 @@ impl<'a> Solver<'a> {
                 stop = Stop::Breakdown;
                 break;
             }
-            if before - after < set.tolerance * before.abs() {
+            if settled && before - after < set.tolerance * before.abs() {
                 stop = Stop::Converged;
                 break;
             }
+            settled |= before - after < set.settled * before.abs();
         }
         self.finish(history, stop)
     }
