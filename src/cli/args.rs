@@ -1,6 +1,6 @@
 //! The command line.
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
 /// Turns a hand-held exposure bracket with camera shake into one sharp HDR irradiance image.
@@ -34,7 +34,8 @@ pub(super) struct MergeArgs {
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
-    /// Camera response: srgb, linear, gamma:2.2, or a file from 'unshaken calibrate' [default: srgb, with a warning]
+    /// Camera response: srgb, linear, gamma:2.2, a file from 'unshaken calibrate', or auto (from these frames) [default: auto for
+    /// JPEG, srgb with a warning for PNG and TIFF]
     #[arg(long, value_name = "NAME|FILE.json")]
     pub response: Option<String>,
     /// Frame on whose pixel grid the result lies [default: the longest sharp frame]
@@ -74,9 +75,19 @@ pub(super) struct CalibrateArgs {
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
+    /// How: debevec (a table, all exposure times believed) or mitsunaga (a polynomial, exposure times refined)
+    #[arg(long, value_name = "NAME", value_enum, default_value_t = Method::Debevec)]
+    pub method: Method,
     /// Replace an output that exists
     #[arg(long)]
     pub overwrite: bool,
+}
+
+/// How a response is calibrated.
+#[derive(Clone, Copy, Debug, PartialEq, ValueEnum)]
+pub(super) enum Method {
+    Debevec,
+    Mitsunaga,
 }
 
 #[derive(Debug, Args)]

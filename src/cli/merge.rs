@@ -16,14 +16,14 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
     frames::check(&args.frames)?;
-    let named = args.response.as_deref().map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
-    let response_file = args.response.as_deref().filter(|_| named.is_none()).map(Path::new);
+    let given = args.response.as_deref().filter(|r| *r != "auto");
+    let named = given.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
+    let response_file = given.filter(|_| named.is_none()).map(Path::new);
     let (exr, preview, report) = outputs(args, response_file)?;
 
     let response = match (named, response_file) {
-        (Some(response), _) => response,
-        (None, Some(path)) => read_response(path)?,
-        (None, None) => Response::Srgb,
+        (None, Some(path)) => Some(read_response(path)?),
+        (named, _) => named,
     };
     let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
     if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
@@ -36,17 +36,15 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
-        if args.response.is_none() {
-            let text =
-                "no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it";
-            events(Event::Warning(text.into()));
-        }
+        let (response, origin) = super::response::choose(args, response, &bracket, events)?;
         if args.frames.len() == settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
-        let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
+        let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
+
+        outcome.report["response"] = origin;
 
         // All are complete before the first is renamed.
         let reference = &bracket.frames()[outcome.reference];

@@ -9,6 +9,7 @@ pub mod demo;
 mod frames;
 mod merge;
 mod progress;
+mod response;
 
 use crate::pipeline::Event;
 use clap::Parser;
