@@ -28,13 +28,15 @@ pub struct Settings {
     pub exclude: Vec<usize>,
     /// α of the Tukey window, 0..=1.
     pub alpha: f64,
+    /// Noise level of the frames; `None`: estimated from them.
+    pub noise: Option<NoiseModel>,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { reference: None, sharp: None, exclude: Vec::new(), alpha: 0.3, deblur: deblur::Settings::default() }
+        Self { reference: None, sharp: None, exclude: Vec::new(), alpha: 0.3, noise: None, deblur: deblur::Settings::default() }
     }
 }
 
@@ -115,7 +117,7 @@ pub fn merge(
     let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let start = Instant::now();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
-    let noise = noise::estimate(frames, &exposures, response);
+    let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
     let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
     let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref());
     let mut run = Run { gpu, kernels, bracket, settings, exposures, masks: Vec::new(), noise, curves, events, timings: Vec::new() };

@@ -50,6 +50,9 @@ pub(super) struct MergeArgs {
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
     #[arg(long, value_name = "A", allow_hyphen_values = true)]
     pub alpha: Option<String>,
+    /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
+    #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
+    pub noise: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,

@@ -6,6 +6,7 @@ use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::Radiometry;
 use crate::io::output::{self, Output};
+use crate::noise::NoiseModel;
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
 use crate::tsf::TsfFile;
@@ -96,6 +97,7 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
             .filter(|a| (0.0..=1.0).contains(a))
             .ok_or_else(|| Usage(format!("--alpha: {word:?} is not a number from 0 to 1")))?;
     }
+    settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
         return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));
@@ -130,6 +132,20 @@ fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, 
     Ok(indices)
 }
 
+/// The level that `--noise` gives.
+fn noise_level(text: &str) -> Result<NoiseModel, Usage> {
+    let refuse =
+        || Usage(format!("--noise: {text:?} is not a full well of at least 1 and a read noise of at least 0 electrons, such as 12000,6"));
+    let (well, read) = text.split_once(',').ok_or_else(refuse)?;
+    match (well.trim().parse::<f64>(), read.trim().parse::<f64>()) {
+        // A read noise of nothing would divide by nothing where the frame is black; a tenth of an electron is as good.
+        (Ok(w), Ok(r)) if w.is_finite() && w >= 1.0 && r.is_finite() && (0.0..=w).contains(&r) => {
+            Ok(NoiseModel::from_electrons(w, r.max(0.1)))
+        }
+        _ => Err(refuse()),
+    }
+}
+
 /// The three outputs, of which each can be written.
 fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Output, Option<Output>, Option<Output>)> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
@@ -145,7 +161,7 @@ fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Ou
 
 fn read_response(path: &Path) -> Result<Response, Error> {
     if !path.exists() {
-        let reason = "is neither srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
+        let reason = "is neither auto, srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
         return Err(Error::Format { path: path.into(), reason });
     }
     let text = crate::io::read_text(path)?;

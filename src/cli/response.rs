@@ -16,9 +16,7 @@ pub(super) fn choose(
     events: &mut dyn FnMut(Event) -> bool,
 ) -> Result<(Response, Value)> {
     let asked = args.response.as_deref() == Some("auto");
-    let jpeg = args.frames.iter().all(|p| {
-        p.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
-    });
+    let jpeg = args.frames.iter().all(|p| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg")));
     if given.is_none() && (asked || jpeg) {
         events(Event::Progress { stage: "estimating the response".into(), fraction: 0.0 });
         match response::automatic(bracket) {

@@ -1,8 +1,8 @@
 //! The response from the bracket that is to be merged, blurred frames included, and whether its exposure times can be true.
 
+use super::Response;
 use super::calibrate::make_monotone;
 use super::shades::{self, Shade};
-use super::Response;
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
 use nalgebra::{Cholesky, DMatrix, DVector};
@@ -98,9 +98,7 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
         }
         let problem = Problem { shades: &shades, times: &times, held: true };
         let shape = if telling < ENOUGH_FOR_CURVE { Shape { powers: 0, shared: true } } else { problem.choose() };
-        let fit = problem
-            .believable(shape)
-            .ok_or_else(|| refuse("no curve that a camera could have explains them".into()))?;
+        let fit = problem.believable(shape).ok_or_else(|| refuse("no curve that a camera could have explains them".into()))?;
         curves = fit.curves.clone();
         chosen = Some((fit, telling));
     }
@@ -123,7 +121,10 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
         ),
     };
     let poor = (telling < ENOUGH_FOR_CURVE).then(|| {
-        format!("only {telling} blocks are well exposed in two frames: the response is taken as a gamma of {:.2}", fit.curves.coefficients[0][0])
+        format!(
+            "only {telling} blocks are well exposed in two frames: the response is taken as a gamma of {:.2}",
+            fit.curves.coefficients[0][0]
+        )
     });
     Ok(Automatic { response: fit.curves.response(), method, poor, exposures })
 }
@@ -140,9 +141,7 @@ impl ExposureCheck {
     /// Frames (0-based) whose exposure time the pixels contradict: by at least [`DISAGREEMENT_EV`] and four standard deviations.
     pub fn suspects(&self) -> Vec<usize> {
         (0..self.difference_ev.len())
-            .filter(|&i| {
-                self.difference_ev[i].is_some_and(|d| d.abs() >= DISAGREEMENT_EV && d.abs() >= SIGNIFICANT * self.deviation_ev[i])
-            })
+            .filter(|&i| self.difference_ev[i].is_some_and(|d| d.abs() >= DISAGREEMENT_EV && d.abs() >= SIGNIFICANT * self.deviation_ev[i]))
             .collect()
     }
 
@@ -422,8 +421,9 @@ impl Problem<'_> {
             let spread = parts.iter().map(|f| (f.times[i] - fit.times[i]).powi(2)).sum::<f64>() * 0.75;
             (fit.variances[i].max(0.0) + spread).sqrt() / ln2
         };
-        let shared: Vec<usize> =
-            (0..n).map(|i| self.shades.iter().filter(|s| tells_ratio(s, self.times) && s.seen.iter().any(|v| v.frame == i)).count()).collect();
+        let shared: Vec<usize> = (0..n)
+            .map(|i| self.shades.iter().filter(|s| tells_ratio(s, self.times) && s.seen.iter().any(|v| v.frame == i)).count())
+            .collect();
         ExposureCheck {
             difference_ev: (0..n).map(|i| (shared[i] >= FEWEST).then(|| (fit.times[i] - self.times[i]) / ln2)).collect(),
             deviation_ev: (0..n).map(deviation).collect(),

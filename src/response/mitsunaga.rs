@@ -117,7 +117,10 @@ fn joint(shorter: &Frame, longer: &Frame, channel: usize) -> Vec<Joint> {
     let filled = table.iter().enumerate().filter(|(_, n)| **n > 0);
     // A pair of codes that few pixels have is an edge, or noise: the work is in the many that are left out.
     let least = (shorter.intensity.width() * shorter.intensity.height()) as u32 / 200_000;
-    filled.filter(|(_, n)| **n > least).map(|(k, &n)| Joint { a: (k / 256) as f64 / 255.0, b: (k % 256) as f64 / 255.0, count: f64::from(n) }).collect()
+    filled
+        .filter(|(_, n)| **n > least)
+        .map(|(k, &n)| Joint { a: (k / 256) as f64 / 255.0, b: (k % 256) as f64 / 255.0, count: f64::from(n) })
+        .collect()
 }
 
 struct Solution {

@@ -83,7 +83,8 @@ fn of_size(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + Sync), side:
     let (width, height) = frames[0].intensity.size();
     let (columns, rows) = (width / side, height / side);
     let jobs: Vec<(usize, usize)> = (0..3).flat_map(|c| (0..frames.len()).map(move |i| (c, i))).collect();
-    let maps: Vec<Vec<Option<Seen>>> = jobs.par_iter().map(|&(c, i)| means(&frames[i], i, c, side, reach, columns, rows, inverse)).collect();
+    let maps: Vec<Vec<Option<Seen>>> =
+        jobs.par_iter().map(|&(c, i)| means(&frames[i], i, c, side, reach, columns, rows, inverse)).collect();
     let mut shades = Vec::new();
     let mut maps = maps.into_iter();
     for channel in 0..3 {

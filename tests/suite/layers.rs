@@ -14,7 +14,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("fft", &[]),
     ("nonnegative", &[]),
     // The stages before the solver: none knows a GPU.
-    ("response", &["error", "image", "exposure"]),
+    ("response", &["error", "image", "exposure", "mask"]),
     ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
     ("mask", &["error", "image", "exposure"]),
     ("merge", &["error", "image", "exposure", "mask", "noise", "kernels::NOISE_STEPS"]),
@@ -61,6 +61,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "error",
             "image",
             "exposure",
+            "noise::NoiseModel",
             "response",
             "baseline",
             "io",
