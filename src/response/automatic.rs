@@ -36,6 +36,9 @@ pub struct ExposureCheck {
 /// A difference of exposure times is spoken of from here: 0.15 EV (11 %). Cameras' nominal times (1/30 for 1/32) are off by up to
 /// 0.1 EV, which a merge hardly feels.
 pub const DISAGREEMENT_EV: f64 = 0.15;
+/// The same where the curve is given: one that was measured on other pictures bends by so much at its dark end that the times of
+/// correct brackets seem off by up to 0.32 EV.
+pub const DISAGREEMENT_OF_KNOWN_CURVE_EV: f64 = 0.4;
 /// And only when it is that many of its standard deviations.
 const SIGNIFICANT: f64 = 4.0;
 /// Fewer shades that two frames of different exposure time share do not tell even an exponent.
@@ -138,10 +141,11 @@ pub fn check_exposures(bracket: &Bracket, response: &Response) -> ExposureCheck 
 }
 
 impl ExposureCheck {
-    /// Frames (0-based) whose exposure time the pixels contradict: by at least [`DISAGREEMENT_EV`] and four standard deviations.
+    /// Frames (0-based) whose exposure time the pixels contradict: by at least [`DISAGREEMENT_EV`] ([`DISAGREEMENT_OF_KNOWN_CURVE_EV`]) and four standard deviations.
     pub fn suspects(&self) -> Vec<usize> {
+        let least = if self.curve_known { DISAGREEMENT_OF_KNOWN_CURVE_EV } else { DISAGREEMENT_EV };
         (0..self.difference_ev.len())
-            .filter(|&i| self.difference_ev[i].is_some_and(|d| d.abs() >= DISAGREEMENT_EV && d.abs() >= SIGNIFICANT * self.deviation_ev[i]))
+            .filter(|&i| self.difference_ev[i].is_some_and(|d| d.abs() >= least && d.abs() >= SIGNIFICANT * self.deviation_ev[i]))
             .collect()
     }
 
