@@ -47,6 +47,12 @@ pub(super) struct MergeArgs {
     /// Leave these frames out
     #[arg(long, value_name = "N,N,...", allow_hyphen_values = true)]
     pub exclude: Option<String>,
+    /// Take the frames as they lie, without registering them against each other
+    #[arg(long)]
+    pub no_align: bool,
+    /// Exit with code 3 when a frame had to be left out (what the others give is written all the same)
+    #[arg(long)]
+    pub strict: bool,
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
     #[arg(long, value_name = "A", allow_hyphen_values = true)]
     pub alpha: Option<String>,
