@@ -104,6 +104,8 @@ const FEATURE_SIDE: usize = 640;
 const SEARCH_SIDE: usize = 160;
 /// Largest shift that the correlation looks for, as a part of the longer side.
 const SEARCH_REACH: f64 = 0.25;
+/// Largest displacement of any pixel, as a part of the longer side.
+const LARGEST_MOTION: f64 = 0.3;
 /// Matches that must agree before the correlation is not needed.
 const ENOUGH_INLIERS: usize = 12;
 /// Motion in pixels, rms over the frame, that counts as none.
@@ -172,6 +174,12 @@ impl<'a> Registrar<'a> {
         found
     }
 
+    /// Whether a hand may have moved the camera so between two frames: little of such a frame would be left on the reference.
+    fn plausible(&self, motion: &DMat3) -> bool {
+        let (w, h) = self.frames[self.reference].intensity.size();
+        distance(motion, &DMat3::IDENTITY, w, h).1 < LARGEST_MOTION * w.max(h) as f64
+    }
+
     fn find(&self, levels: &[Picture], sharp: bool) -> Registration {
         let tones: Vec<(Tone, Tone)> = levels
             .iter()
@@ -215,8 +223,9 @@ impl<'a> Registrar<'a> {
             let fit = direct::align(reference, frame, &levels[small].local(&start), Model::Rigid, 10);
             let (share, tiles) = direct::agreement(reference, frame, &fit.motion, 4.0);
             let score = share * (tiles as f64 / 12.0).min(1.0) - 1e-3 * fit.cost;
-            if best.as_ref().is_none_or(|b| score > b.0) {
-                best = Some((score, method, levels[small].global(&fit.motion)));
+            let motion = levels[small].global(&fit.motion);
+            if best.as_ref().is_none_or(|b| score > b.0 && self.plausible(&motion)) {
+                best = Some((score, method, motion));
             }
         }
         let (_, method, mut motion) = best.expect("no motion is always a candidate");
@@ -287,7 +296,7 @@ impl<'a> Registrar<'a> {
                 reason =
                     "has too little structure in common with the other frames to be registered (--no-align takes it as it lies)".into();
             }
-        } else if agreement < AGREEMENT {
+        } else if agreement < AGREEMENT || !self.plausible(&motion) {
             reason = format!(
                 "shows something else, or moved otherwise than as a whole: {:.0} % of its parts fit the other frames",
                 100.0 * agreement
