@@ -14,7 +14,7 @@ pub(super) struct CommandLine {
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
     /// Reconstruct the sharp irradiance of a bracket
-    Merge(MergeArgs),
+    Merge(Box<MergeArgs>),
     /// Measure the camera's response from an unblurred bracket (tripod), for merge --response
     Calibrate(CalibrateArgs),
     /// Make a shaken bracket, reconstruct it, and show what was gained
