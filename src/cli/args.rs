@@ -14,7 +14,7 @@ pub(super) struct CommandLine {
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
     /// Reconstruct the sharp irradiance of a bracket
-    Merge(MergeArgs),
+    Merge(Box<MergeArgs>),
     /// Measure the camera's response from an unblurred bracket (tripod), for merge --response
     Calibrate(CalibrateArgs),
     /// Make a shaken bracket, reconstruct it, and show what was gained
@@ -47,6 +47,12 @@ pub(super) struct MergeArgs {
     /// Leave these frames out
     #[arg(long, value_name = "N,N,...", allow_hyphen_values = true)]
     pub exclude: Option<String>,
+    /// Take the frames as they lie, without registering them against each other
+    #[arg(long)]
+    pub no_align: bool,
+    /// Exit with code 3 when a frame had to be left out (what the others give is written all the same)
+    #[arg(long)]
+    pub strict: bool,
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
     #[arg(long, value_name = "A", allow_hyphen_values = true)]
     pub alpha: Option<String>,

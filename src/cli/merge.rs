@@ -1,7 +1,7 @@
 //! `unshaken merge`.
 
 use super::args::MergeArgs;
-use super::{Usage, frames, with_progress};
+use super::{Done, Usage, frames, with_progress};
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::Radiometry;
@@ -12,7 +12,7 @@ use crate::response::{Response, ResponseFile};
 use crate::tsf::TsfFile;
 use std::path::{Path, PathBuf};
 
-pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
+pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
@@ -31,7 +31,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         check_tsf_names(file, path, &args.frames)?;
     }
 
-    let text = with_progress(|events| {
+    let (text, left_out) = with_progress(|events| {
         events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
         let bracket = frames::read(&args.frames, times)?;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
@@ -60,10 +60,10 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         for file in staged {
             file.commit()?;
         }
-        Ok(summary(args, &bracket, outcome.reference))
+        Ok((summary(args, &bracket, outcome.reference), outcome.left_out))
     })?;
     println!("{text}");
-    Ok(())
+    Ok(if args.strict && !left_out.is_empty() { Done::Degraded } else { Done::AsAsked })
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
@@ -80,7 +80,7 @@ fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
 
 fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     let n = args.frames.len();
-    let mut settings = Settings::default();
+    let mut settings = Settings { align: !args.no_align, ..Settings::default() };
     if let Some(word) = &args.reference {
         settings.reference = Some(frame_number("--reference", word, n)?);
     }

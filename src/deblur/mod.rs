@@ -20,8 +20,8 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget, channels,
-    partials_1d, partials_2d,
+    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget,
+    channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use serde::Serialize;
@@ -130,6 +130,14 @@ pub struct Solution {
 }
 
 impl Solution {
+    /// Irradiance on the frame's grid plus `pad` pixels on every side; beyond what was solved for, that of the nearest pixel.
+    pub fn with_pad(&self, pad: usize) -> Rgb {
+        let (w, h) = self.irradiance.size();
+        let own = self.pad as isize - pad as isize;
+        let (w, h) = (w - 2 * self.pad + 2 * pad, h - 2 * self.pad + 2 * pad);
+        self.irradiance.map_planes(|p| Plane::from_fn(w, h, |x, y| p.clamped(x as isize + own, y as isize + own)))
+    }
+
     /// Irradiance on the frame's grid alone.
     pub fn cropped(&self) -> Rgb {
         let (w, h) = self.irradiance.size();
@@ -138,26 +146,45 @@ impl Solution {
 }
 
 /// Pixels by which the latent grid must surround the frame so that no pose of `tsfs` looks beyond it, at most `limit`.
+///
+/// A frame that is displaced as a whole counts by how far its poses spread: what it shows beyond the reference no other frame confirms, and
+/// an estimate of it from two steps would be wrong by more than the frame's noise. Its pixels that look there are masked.
 pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usize {
     let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(i, j)| glam::DVec2::new(i * x, j * y));
     let mut worst = 0.0f64;
     for tsf in tsfs.iter().filter(|t| !t.is_identity()) {
+        let centre = tsf.centre();
+        let displaced = corners.iter().any(|&c| (crate::pose::project(&centre, c) - c).length() > DISPLACED);
         for pose in &tsf.poses {
-            let inverse = pose.homography(tsf.focal_px).inverse();
-            for (i, j) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
-                let p = crate::pose::project(&inverse, glam::DVec2::new(i * x, j * y));
+            let mut back = (pose.homography(tsf.focal_px) * tsf.base).inverse();
+            if displaced || tsf.poses.len() == 1 {
+                back = centre * back;
+            }
+            for corner in corners {
+                let p = crate::pose::project(&back, corner);
                 worst = worst.max(p.x.abs() - x).max(p.y.abs() - y);
             }
         }
     }
-    if worst == 0.0 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
+    if worst < 1e-6 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
 }
+
+/// Displacement in pixels from which a frame counts as displaced rather than shaken.
+const DISPLACED: f64 = 4.0;
 
 struct Moving {
     blur: Blur,
+    still: bool,
     energy: f32,
     weight: Channels,
     observation: Channels,
+}
+
+impl Moving {
+    fn of<'k>(&self, kernels: &'k Kernels) -> &'k BlurKernels {
+        if self.still { &kernels.still } else { &kernels.blur }
+    }
 }
 
 struct Observed {
@@ -255,12 +282,14 @@ impl<'a> Solver<'a> {
         check(observations, initial)?;
         let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
         let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
-        let blurs: Vec<Option<(Blur, f32)>> = observations
+        let blurs: Vec<Option<(Blur, bool, f32)>> = observations
             .iter()
             .map(|o| {
                 (!o.tsf.is_identity()).then(|| {
                     let taps = TapSet::new(&o.tsf, frame.0, frame.1, settings.interpolation);
-                    (Blur::new(gpu, &kernels.blur, &taps, frame, pad), taps.energy() as f32)
+                    let still = o.tsf.single().is_some();
+                    let compiled = if still { &kernels.still } else { &kernels.blur };
+                    (Blur::new(gpu, compiled, &taps, frame, pad), still, taps.energy() as f32)
                 })
             })
             .collect();
@@ -298,7 +327,9 @@ impl<'a> Solver<'a> {
         for (o, blur) in observations.iter().zip(blurs) {
             let moving = match blur {
                 None => None,
-                Some((blur, energy)) => Some(Moving { blur, energy, weight: ch("weights", m)?, observation: ch("observations", m)? }),
+                Some((blur, still, energy)) => {
+                    Some(Moving { blur, still, energy, weight: ch("weights", m)?, observation: ch("observations", m)? })
+                }
             };
             observed.push(Observed {
                 exposure: upload_rgb(gpu, "exposure", &o.exposure)?,
@@ -319,7 +350,7 @@ impl<'a> Solver<'a> {
         let ones: Channels = std::array::from_fn(|_| one.clone());
         for (o, observed) in self.observations.iter().zip(&mut self.observed) {
             if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &self.state.scratch, &ones, &self.state.predicted));
+                self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &self.state.scratch, &ones, &self.state.predicted));
                 let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
                 let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
                 observed.mask = self.gpu.upload("mask", &mask)?;
@@ -364,7 +395,7 @@ impl<'a> Solver<'a> {
                     first = false;
                 }
                 Some(moving) => {
-                    steps.extend(moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+                    steps.extend(moving.blur.forward(self.gpu, moving.of(self.kernels), &s.scratch, &s.irradiance, &s.predicted));
                     steps.extend(data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch));
                     let to = WeightTarget {
                         weight: &moving.weight,
@@ -391,14 +422,14 @@ impl<'a> Solver<'a> {
             partial += partials_1d(n);
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.irradiance, &s.predicted));
+            steps.extend(moving.blur.forward(self.gpu, moving.of(k), &s.scratch, &s.irradiance, &s.predicted));
             for c in 0..3 {
                 let (w, o) = (&moving.weight[c], &moving.observation[c]);
                 steps.push(k.data.residual(self.gpu, &s.predicted[c], w, o, &s.frame[c], &s.partials, partial, m));
                 partial += partials_1d(m);
             }
             if project_back {
-                steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.frame, &s.back, 1.0));
+                steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &s.frame, &s.back, 1.0));
             }
         }
         steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, partial, SLOT_DATA, false));
@@ -420,7 +451,7 @@ impl<'a> Solver<'a> {
         let n = self.latent.0 * self.latent.1;
         let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &moving.weight, &s.data_diagonal, moving.energy));
+            steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &moving.weight, &s.data_diagonal, moving.energy));
         }
         for c in 0..3 {
             steps.push(k.linear.right_side(
@@ -459,11 +490,11 @@ impl<'a> Solver<'a> {
             steps.push(k.linear.scale(self.gpu, &s.irradiance[c], &s.direction[c], &s.weight[c], &s.scaled[c], &s.back[c], n));
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.scaled, &s.predicted));
+            steps.extend(moving.blur.forward(self.gpu, moving.of(k), &s.scratch, &s.scaled, &s.predicted));
             for c in 0..3 {
                 steps.push(k.linear.multiply(self.gpu, &moving.weight[c], &s.predicted[c], self.frame.0 * self.frame.1));
             }
-            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.predicted, &s.back, 1.0));
+            steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &s.predicted, &s.back, 1.0));
         }
         for c in 0..3 {
             let partial = c * partials_2d(self.latent);
@@ -575,7 +606,7 @@ impl<'a> Solver<'a> {
         let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
         for (i, observed) in self.observed.iter().enumerate() {
             if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+                self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &s.scratch, &s.irradiance, &s.predicted));
             }
             let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);
             self.gpu.submit(&steps[..1]);

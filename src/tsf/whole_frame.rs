@@ -26,6 +26,8 @@ pub struct WholeFrame<'a> {
     pub blurred: &'a Plane,
     /// Inverse variance of the frame's pixels, model error included; 0: masked.
     pub weight: &'a Plane,
+    /// Motion of the frame as a whole, about which the poses are looked for (see [`Tsf::base`]).
+    pub base: DMat3,
 }
 
 /// A weighted difference of two neighbouring pixels.
@@ -83,6 +85,8 @@ impl WholeFrame<'_> {
     fn rows(&self, count: usize) -> Vec<Row> {
         let (w, h) = self.size();
         let mut rows: Vec<(f32, Row)> = Vec::new();
+        let moved = (self.base != DMat3::IDENTITY).then(|| warp(self.latent, self.pad, (w, h), 0, &self.base, Interpolation::Bilinear));
+        let latent = |x: usize, y: usize| moved.as_ref().map_or_else(|| self.latent.at(x + self.pad, y + self.pad), |m| m.at(x, y));
         for y in 0..h {
             for x in 0..w {
                 for vertical in [false, true] {
@@ -94,7 +98,7 @@ impl WholeFrame<'_> {
                     let (a, b) = (self.weight.at(x, y), self.weight.at(i, j));
                     if a > 0.0 && b > 0.0 {
                         let k = a * b / (a + b);
-                        let e = self.latent.at(i + self.pad, j + self.pad) - self.latent.at(x + self.pad, y + self.pad);
+                        let e = latent(i, j) - latent(x, y);
                         let d = self.blurred.at(i, j) - self.blurred.at(x, y);
                         rows.push((k * (e * e + d * d), Row { weight: k, ..row }));
                     }
@@ -130,7 +134,8 @@ impl WholeFrame<'_> {
         let bases: Vec<Plane> = grid
             .angles_deg
             .iter()
-            .map(|a| warp(self.latent, self.pad, (w, h), r, &Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal), Interpolation::Bicubic))
+            .map(|a| Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal) * self.base)
+            .map(|m| warp(self.latent, self.pad, (w, h), r, &m, Interpolation::Bicubic))
             .collect();
         let fft = Fft2::new(w + 2 * r, h + 2 * r);
         let spectra: Vec<Spectrum> = bases.par_iter().map(|b| fft.forward(&b.data, b.width)).collect();
@@ -196,7 +201,7 @@ impl WholeFrame<'_> {
                 Pose::planar((id % n) as f64 - r as f64, (id / n % n) as f64 - r as f64, grid.angles_deg[id / (n * n)], weight)
             })
             .collect();
-        Tsf::new(focal, poses).ok()
+        Tsf::new(focal, poses).ok().map(|t| t.about(self.base))
     }
 
     /// Continuous poses from `tsf`: translations, angles and weights move freely (Gauss-Newton with Levenberg damping), by at most 0.9 px in
@@ -228,7 +233,7 @@ impl WholeFrame<'_> {
             merge_close(&mut particles);
         }
         let poses = particles.iter().map(|p| Pose { weight: p.weight, ..Pose::planar(p.x, p.y, p.beta * step, 1.0) }).collect();
-        Tsf::new(tsf.focal_px, poses).unwrap_or_else(|_| tsf.clone())
+        Tsf::new(tsf.focal_px, poses).map_or_else(|_| tsf.clone(), |t| t.about(self.base))
     }
 }
 
@@ -321,7 +326,7 @@ impl Taps {
         let last = index.keys().map(|k| k.0).max().unwrap_or(0);
         let bases: Vec<Plane> = (0..=last)
             .map(|b| {
-                let h = Pose::planar(0.0, 0.0, first_deg + f64::from(b) * step_deg, 1.0).rotation(focal);
+                let h = Pose::planar(0.0, 0.0, first_deg + f64::from(b) * step_deg, 1.0).rotation(focal) * frame.base;
                 warp(frame.latent, frame.pad, frame.size(), margin, &h, interpolation)
             })
             .collect();

@@ -383,6 +383,30 @@ fn frames_are_left_out_or_taken_as_sharp_as_told() {
 }
 
 #[test]
+fn a_frame_of_another_scene_is_left_out_by_name() {
+    let dir = tempdir().unwrap();
+    tiny(dir.path(), [0.0; 3], 0.4);
+    let other = image::open(dir.path().join("frame2.png")).unwrap().into_rgb8();
+    image::imageops::rotate180(&other).save(dir.path().join("frame2.png")).unwrap();
+    let (_, _, report, said) = merge_tiny(dir.path(), "other", &[]);
+    assert!(said.lines().any(|l| l.starts_with("warning: frame2.png: ") && l.ends_with("it is left out")), "{said}");
+    assert_eq!(column(&report, "used"), [true, false, true]);
+    assert_eq!(column(&report, "registration").iter().map(|r| r["registered"] == true).collect::<Vec<_>>(), [true, false, true]);
+    assert_eq!(report["left_out"][0]["frame"], "frame2.png");
+    // The same bracket, when it must be as asked, and when nobody shall look.
+    let call = |more: &str| {
+        let line = format!("merge --exposures 1/30,1/8,1/2 --response srgb -o x.exr --overwrite {more} frame1.png frame2.png frame3.png");
+        unshaken(dir.path(), &line.split_whitespace().collect::<Vec<_>>())
+    };
+    let strict = call("--strict");
+    assert_eq!(strict.status.code(), Some(3), "{}", String::from_utf8_lossy(&strict.stderr));
+    assert!(dir.path().join("x.exr").exists());
+    let (_, _, report, said) = merge_tiny(dir.path(), "in-place", &["--no-align", "--strict"]);
+    assert!(!said.contains("left out"), "{said}");
+    assert_eq!(column(&report, "registration")[1]["method"], "skipped");
+}
+
+#[test]
 fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
     let dir = tempdir().unwrap();
     // Bright, or the shortest frame's blur is lost in its noise.

@@ -16,11 +16,11 @@ const TABLE: &[(&str, &[&str])] = &[
     // The stages before the solver: none knows a GPU.
     ("response", &["error", "image", "exposure", "mask"]),
     ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
-    ("mask", &["error", "image", "exposure"]),
-    ("merge", &["error", "image", "exposure", "mask", "noise", "kernels::NOISE_STEPS"]),
+    ("mask", &["error", "image", "exposure", "pose"]),
+    ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "noise"]),
-    ("register", &["error", "image", "pose", "exposure", "noise", "mask"]),
-    ("triage", &["error", "image", "exposure", "noise", "mask"]),
+    ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft"]),
+    ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
     // The device, its operators, the solver.

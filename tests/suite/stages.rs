@@ -1,6 +1,7 @@
 //! The estimators, each on input whose answer is planted.
 
 use crate::support::noise as numbers;
+use glam::DMat3;
 use unshaken::exposure::Frame;
 use unshaken::image::{Plane, Rgb};
 use unshaken::mask;
@@ -102,7 +103,9 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         levels: 255,
         exposure_time,
     };
-    let one = |frames: &[Frame], sharp: &[bool]| mask::masks(frames, sharp, 0.3).iter().map(|m| m.data[0]).collect::<Vec<f32>>();
+    let one = |frames: &[Frame], sharp: &[bool]| {
+        mask::masks(frames, sharp, 0.3, &vec![DMat3::IDENTITY; frames.len()]).iter().map(|m| m.data[0]).collect::<Vec<f32>>()
+    };
     // A clipped red has a grey of 0.3, in the flat part of the window.
     assert_eq!(one(&[frame([1.0, 0.0, 0.0], 1.0)], &[true]), [0.0]);
     // The low taper applies only where a longer frame, at least as sharp, covers the pixel well.
@@ -110,6 +113,15 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     assert!(one(&[dark.clone(), longer.clone()], &[true, true])[0] < 0.5);
     assert_eq!(one(&[dark.clone(), longer], &[true, false]), [1.0, 1.0]);
     assert_eq!(one(&[dark, frame([1.0; 3], 1.0)], &[true, true]), [1.0, 0.0]);
+
+    // Covered is judged where the longer frame has the same point of the scene: here one pixel to the right.
+    let row = |values: [f32; 3], exposure_time| Frame {
+        intensity: Rgb([(); 3].map(|()| Plane { width: 3, height: 1, data: values.to_vec() })),
+        ..frame([0.0; 3], exposure_time)
+    };
+    let motions = [DMat3::IDENTITY, DMat3::from_translation(glam::DVec2::new(1.0, 0.0))];
+    let found = mask::masks(&[row([0.05; 3], 0.1), row([0.0, 0.4, 0.0], 1.0)], &[true, true], 0.3, &motions);
+    assert!(found[0].data[0] < 0.5 && found[0].data[1..] == [1.0, 1.0], "{found:?}");
 }
 
 #[test]
@@ -197,7 +209,7 @@ fn the_whole_frame_gives_the_tsf_on_the_grid_and_between() {
         ("between", planted(&[(0.3, -0.4, 0.1, 0.3), (1.4, 0.7, 0.3, 0.3), (2.6, 1.5, 0.55, 0.2), (3.5, 2.4, 0.8, 0.2)]), 0.05),
     ] {
         let blurred = blur(&latent, pad, &truth, SIZE);
-        let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight };
+        let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
         let coarse = frame.fit_grid(&grid, None).expect("something fits");
         let fine = frame.refine(&coarse, Interpolation::Bilinear, 2);
         let (a, b) = (operator_error(&latent, pad, &coarse, &truth, SIZE), operator_error(&latent, pad, &fine, &truth, SIZE));
@@ -221,7 +233,7 @@ fn shaken_frames_are_told_from_sharp_ones() {
         let frames = made.bracket.frames();
         let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
         let level = noise::estimate(frames, &exposures, &Response::Srgb);
-        let found = triage::triage(frames, &exposures, &level, &[false; 3], None);
+        let found = triage::triage(frames, &exposures, &level, &[false; 3], None, &[DMat3::IDENTITY; 3]);
         assert_eq!(found.iter().map(|v| !v.sharp).collect::<Vec<_>>(), shaken, "{found:?}");
     }
 }
