@@ -14,7 +14,7 @@ use crate::psf;
 use crate::register::{self, Registrar, Registration};
 use crate::response::Response;
 use crate::triage::{self, Verdict};
-use crate::tsf::{self, Tsf, TsfEntry, TsfFile, WholeFrame};
+use crate::tsf::{self, Interpolation, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -34,6 +34,9 @@ pub struct Settings {
     pub alpha: f64,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
+    /// Interpolation of the warps; `None`: bilinear where a sharp frame holds the irradiance in place, bicubic where none does and
+    /// the warps' own blur would be sharpened away twice. Takes the place of that in `deblur`.
+    pub interpolation: Option<Interpolation>,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
@@ -47,6 +50,7 @@ impl Default for Settings {
             align: true,
             alpha: 0.3,
             noise: None,
+            interpolation: None,
             deblur: deblur::Settings::default(),
         }
     }
@@ -132,18 +136,21 @@ pub fn merge(
     let frames = bracket.frames();
     let excluded = check(bracket, settings)?;
     let gpu = Gpu::new()?;
-    let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let start = Instant::now();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
     let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
     let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
     let motions = vec![DMat3::IDENTITY; frames.len()];
     let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
+    let mut settings = settings.clone();
+    settings.deblur.interpolation =
+        settings.interpolation.unwrap_or(if verdicts.iter().any(|v| v.sharp) { Interpolation::Bilinear } else { Interpolation::Bicubic });
+    let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let mut run = Run {
         gpu,
         kernels,
         bracket,
-        settings,
+        settings: &settings,
         exposures,
         masks: Vec::new(),
         noise,

@@ -9,7 +9,7 @@ use crate::io::output::{self, Output};
 use crate::noise::NoiseModel;
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
-use crate::tsf::TsfFile;
+use crate::tsf::{Interpolation, TsfFile};
 use std::path::{Path, PathBuf};
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
@@ -98,6 +98,11 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
             .ok_or_else(|| Usage(format!("--alpha: {word:?} is not a number from 0 to 1")))?;
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
+    settings.interpolation = args.interpolation.as_deref().map(|word| match word {
+        "bicubic" => Interpolation::Bicubic,
+        "six-point" => Interpolation::SixPoint,
+        _ => Interpolation::Bilinear,
+    });
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
         return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));

@@ -73,9 +73,9 @@ impl Default for Settings {
             epsilon: 0.01,
             outer: 8,
             inner: 16,
-            tolerance: 1e-2,
+            tolerance: 5e-3,
             robust: 1.0,
-            settled: 0.6,
+            settled: 0.3,
             reweight: true,
             interpolation: Interpolation::default(),
         }
