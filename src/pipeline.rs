@@ -333,7 +333,7 @@ impl Run<'_> {
             patches.iter().filter_map(|p| Some((*p, psf::estimate(&latent, 0, &blurred, &weight, p, GRID_RADIUS)?))).collect();
         let grid = PoseGrid::new(w, h, GRID_RADIUS, GRID_DEGREES, 1.0);
         let from_psfs = tsf::from_psfs(&psfs, &grid, w, h);
-        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
+        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base: glam::DMat3::IDENTITY };
         let tsf = frame.fit_grid(&grid, from_psfs.as_ref());
         let tsf = tsf.map(|t| frame.refine(&t, self.settings.deblur.interpolation, 1));
         let detail = json!({
@@ -349,7 +349,7 @@ impl Run<'_> {
     fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
         let latent = latent.mean();
         let (blurred, weight) = self.luminance(i, &latent);
-        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight };
+        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base: glam::DMat3::IDENTITY };
         tsf.map(|t| frame.refine(t, self.settings.deblur.interpolation, 1))
     }
 

@@ -5,7 +5,9 @@
 
 use super::Tsf;
 use super::active_set::ActiveSet;
+use super::continuous::Evidence;
 use super::from_psfs::nominal_focal;
+use super::model::{Chart, Model};
 use super::taps::Interpolation;
 use crate::fft::{Fft2, Spectrum};
 use crate::image::Plane;
@@ -26,19 +28,21 @@ pub struct WholeFrame<'a> {
     pub blurred: &'a Plane,
     /// Inverse variance of the frame's pixels, model error included; 0: masked.
     pub weight: &'a Plane,
+    /// Where the frame lies on the latent grid before it moves (frame from latent, centred pixels): every pose comes after it.
+    pub base: DMat3,
 }
 
 /// A weighted difference of two neighbouring pixels.
 #[derive(Clone, Copy)]
-struct Row {
-    x: u32,
-    y: u32,
+pub(super) struct Row {
+    pub x: u32,
+    pub y: u32,
     vertical: bool,
-    weight: f32,
+    pub weight: f32,
 }
 
 impl Row {
-    fn other(&self) -> (usize, usize) {
+    pub fn other(&self) -> (usize, usize) {
         let v = usize::from(self.vertical);
         (self.x as usize + 1 - v, self.y as usize + v)
     }
@@ -75,16 +79,16 @@ fn warp(latent: &Plane, pad: usize, size: (usize, usize), margin: usize, h: &DMa
 }
 
 impl WholeFrame<'_> {
-    fn size(&self) -> (usize, usize) {
+    pub(super) fn size(&self) -> (usize, usize) {
         self.blurred.size()
     }
 
-    /// The `count` differences with most noise-weighted structure.
-    fn rows(&self, count: usize) -> Vec<Row> {
+    /// The `count` differences, at least `margin` pixels from the border, with most noise-weighted structure.
+    pub(super) fn rows(&self, count: usize, margin: usize) -> Vec<Row> {
         let (w, h) = self.size();
         let mut rows: Vec<(f32, Row)> = Vec::new();
-        for y in 0..h {
-            for x in 0..w {
+        for y in margin..h.saturating_sub(margin) {
+            for x in margin..w.saturating_sub(margin) {
                 for vertical in [false, true] {
                     let row = Row { x: x as u32, y: y as u32, vertical, weight: 0.0 };
                     let (i, j) = row.other();
@@ -110,7 +114,7 @@ impl WholeFrame<'_> {
         rows
     }
 
-    fn targets(&self, rows: &[Row]) -> Vec<f32> {
+    pub(super) fn targets(&self, rows: &[Row]) -> Vec<f32> {
         rows.iter()
             .map(|r| {
                 let (i, j) = r.other();
@@ -125,12 +129,21 @@ impl WholeFrame<'_> {
         let focal = nominal_focal(w, h);
         let r = grid.radius;
         let n = 2 * r + 1;
-        let rows = self.rows(40_000);
+        let rows = self.rows(40_000, 0);
         let targets = self.targets(&rows);
         let bases: Vec<Plane> = grid
             .angles_deg
             .iter()
-            .map(|a| warp(self.latent, self.pad, (w, h), r, &Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal), Interpolation::Bicubic))
+            .map(|a| {
+                warp(
+                    self.latent,
+                    self.pad,
+                    (w, h),
+                    r,
+                    &(Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal) * self.base),
+                    Interpolation::Bicubic,
+                )
+            })
             .collect();
         let fft = Fft2::new(w + 2 * r, h + 2 * r);
         let spectra: Vec<Spectrum> = bases.par_iter().map(|b| fft.forward(&b.data, b.width)).collect();
@@ -197,6 +210,26 @@ impl WholeFrame<'_> {
             })
             .collect();
         Tsf::new(focal, poses).ok()
+    }
+
+    /// As [`WholeFrame::refine`], within `model`, without taps.
+    pub fn refine_free(&self, tsf: &Tsf, model: Model, interpolation: Interpolation, count: usize, iterations: usize) -> Tsf {
+        let (w, h) = self.size();
+        let corner = 0.5 * (w as f64).hypot(h as f64);
+        let step = (0.7 / corner).to_degrees();
+        let mut particles: Vec<Particle> = tsf
+            .poses
+            .iter()
+            .map(|p| Particle { x: p.t_x, y: p.t_y, beta: p.theta_z_deg / step, weight: p.weight, ..Default::default() })
+            .collect();
+        absorb(&mut particles);
+        let chart = Chart::new(model, tsf.focal_px, w, h);
+        let poses: Vec<Pose> = particles.iter().map(|p| Pose { weight: p.weight, ..Pose::planar(p.x, p.y, p.beta * step, 1.0) }).collect();
+        let Ok(start) = Tsf::new(tsf.focal_px, poses) else { return tsf.clone() };
+        let margin =
+            tsf.poses.iter().fold(0.0f64, |m, p| m.max(p.t_x.abs()).max(p.t_y.abs()) + p.theta_z_deg.to_radians().abs() * corner * 0.0);
+        let rows = self.rows(count, margin as usize + 4);
+        Evidence::new(self, &rows, interpolation).refine(&start, &chart, iterations)
     }
 
     /// Continuous poses from `tsf`: translations, angles and weights move freely (Gauss-Newton with Levenberg damping), by at most 0.9 px in
@@ -322,10 +355,10 @@ impl Taps {
         let bases: Vec<Plane> = (0..=last)
             .map(|b| {
                 let h = Pose::planar(0.0, 0.0, first_deg + f64::from(b) * step_deg, 1.0).rotation(focal);
-                warp(frame.latent, frame.pad, frame.size(), margin, &h, interpolation)
+                warp(frame.latent, frame.pad, frame.size(), margin, &(h * frame.base), interpolation)
             })
             .collect();
-        let rows = frame.rows(TAP_ROWS);
+        let rows = frame.rows(TAP_ROWS, 0);
         let targets = frame.targets(&rows);
         let mut keys = vec![(0, 0, 0); n];
         for (k, i) in &index {
