@@ -8,7 +8,7 @@ use crate::io::exr::Radiometry;
 use crate::io::output::{self, Output};
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
-use crate::tsf::TsfFile;
+use crate::tsf::{Model, TsfFile};
 use std::path::{Path, PathBuf};
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
@@ -44,6 +44,11 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         if args.frames.len() == settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
+        }
+        let mut settings = settings.clone();
+        if settings.focal_px.is_none() {
+            let (w, h) = bracket.size();
+            settings.focal_px = frames::focal_px(&args.frames[0], w, h)?;
         }
         let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
@@ -97,6 +102,19 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
             .ok()
             .filter(|a| (0.0..=1.0).contains(a))
             .ok_or_else(|| Usage(format!("--alpha: {word:?} is not a number from 0 to 1")))?;
+    }
+    if let Some(word) = &args.model {
+        let names: Vec<&str> = Model::ALL.iter().map(|m| m.name()).collect();
+        settings.model =
+            Model::named(word).ok_or_else(|| Usage(format!("--model: {word:?} is not a model; choose one of {}", names.join(", "))))?;
+    }
+    if let Some(word) = &args.focal_px {
+        let focal = word.parse().ok().filter(|f: &f64| f.is_finite() && *f > 0.0);
+        settings.focal_px = Some(focal.ok_or_else(|| Usage(format!("--focal-px: {word:?} is not a positive number of pixels")))?);
+    }
+    for word in &args.patch {
+        let pixel = word.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+        settings.patches.push(pixel.ok_or_else(|| Usage(format!("--patch: {word:?} is not a pixel such as 120,80")))?);
     }
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {

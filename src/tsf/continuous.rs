@@ -5,7 +5,6 @@
 
 use super::Tsf;
 use super::model::{Chart, Coordinates};
-use super::taps::Interpolation;
 use super::whole_frame::{Row, WholeFrame};
 use crate::image::Plane;
 use crate::nonnegative::{coordinate_descent, gram};
@@ -14,15 +13,6 @@ use glam::{DMat3, DVec2};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use std::collections::HashMap;
-
-/// How the latent irradiance is read between its pixels.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Reading {
-    /// As the blur K computes it under bilinear interpolation: a bilinear warp, then a bilinear split of the translation on whole pixels.
-    Twice,
-    /// Cubic convolution.
-    Cubic,
-}
 
 /// A frame's differences that count, and the pixels between which they are taken.
 pub(super) struct Evidence<'a> {
@@ -34,7 +24,6 @@ pub(super) struct Evidence<'a> {
     /// (pixel, pixel, √weight); the difference is second minus first.
     rows: Vec<(u32, u32, f32)>,
     targets: Vec<f32>,
-    reading: Reading,
 }
 
 /// √weight of the row that says that weights sum to 1, as a part of the root mean square of the columns: exposures are known to a per cent or
@@ -45,7 +34,7 @@ const SUM: f64 = 30.0;
 const PERSPECTIVE: f64 = 2.0;
 
 impl<'a> Evidence<'a> {
-    pub fn new(frame: &WholeFrame<'a>, rows: &[Row], interpolation: Interpolation) -> Self {
+    pub fn new(frame: &WholeFrame<'a>, rows: &[Row]) -> Self {
         let (w, h) = frame.size();
         let mut index: HashMap<(u32, u32), u32> = HashMap::with_capacity(2 * rows.len());
         let mut pixels = Vec::new();
@@ -70,51 +59,23 @@ impl<'a> Evidence<'a> {
             pixels,
             rows: list,
             targets: frame.targets(rows),
-            reading: if interpolation == Interpolation::Bilinear { Reading::Twice } else { Reading::Cubic },
         }
-    }
-
-    /// Latent irradiance under every pixel as the pose with homography `h` (translation `t`, then the rest) sees it, and its gradient.
-    fn look(&self, pose: &Pose, focal: f64, slopes: bool) -> (Vec<f32>, Vec<[f32; 2]>) {
-        let turn = self.back * pose.rotation(focal).inverse();
-        let t = DVec2::new(pose.t_x, pose.t_y);
-        let mut values = Vec::with_capacity(self.pixels.len());
-        let mut gradients = Vec::with_capacity(if slopes { self.pixels.len() } else { 0 });
-        match self.reading {
-            Reading::Cubic => {
-                for q in &self.pixels {
-                    let p = project(&turn, *q - t) + self.origin;
-                    let (v, g) = cubic(self.latent, p);
-                    values.push(v);
-                    if slopes {
-                        gradients.push(g);
-                    }
-                }
-            }
-            Reading::Twice => {
-                let (whole, f) = (t.floor(), t - t.floor());
-                let (fx, fy) = (f.x as f32, f.y as f32);
-                for q in &self.pixels {
-                    let at = |i: f64, j: f64| linear(self.latent, project(&turn, *q - whole - DVec2::new(i, j)) + self.origin);
-                    let (a, b, c, d) = (at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0));
-                    values.push((1.0 - fy) * ((1.0 - fx) * a + fx * b) + fy * ((1.0 - fx) * c + fx * d));
-                    if slopes {
-                        // A step to the right looks further to the left.
-                        gradients.push([(1.0 - fy) * (a - b) + fy * (c - d), (1.0 - fx) * (a - c) + fx * (b - d)]);
-                    }
-                }
-            }
-        }
-        (values, gradients)
     }
 
     /// Weighted differences that `pose` makes of the latent irradiance: its column of A.
     fn column(&self, pose: &Pose, focal: f64) -> Vec<f32> {
-        let (v, _) = self.look(pose, focal, false);
+        let turn = self.back * pose.rotation(focal).inverse();
+        let t = DVec2::new(pose.t_x, pose.t_y);
+        let v: Vec<f32> = self.pixels.iter().map(|q| cubic(self.latent, project(&turn, *q - t) + self.origin)).collect();
         self.rows.iter().map(|&(a, b, k)| k * (v[b as usize] - v[a as usize])).collect()
     }
 
-    /// Weighted squared residual of `tsf`, mean over the differences, and that of each block of rows (`blocks[row]`) when asked.
+    /// Weighted differences of the frame.
+    pub fn targets(&self) -> &[f32] {
+        &self.targets
+    }
+
+    /// Weighted residual of `tsf` at each difference.
     pub fn residual(&self, tsf: &Tsf) -> Vec<f32> {
         let columns: Vec<Vec<f32>> = tsf.poses.par_iter().map(|p| self.column(p, tsf.focal_px)).collect();
         let mut r = self.targets.clone();
@@ -152,7 +113,6 @@ impl<'a> Evidence<'a> {
         let per = free + 1;
         let mut particles: Vec<(Coordinates, f64)> = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
         let rows = self.rows.len();
-        let inverse_base = linear_part(&self.back);
         let predict = |particles: &[(Coordinates, f64)]| -> (Vec<f32>, f64) {
             let columns: Vec<Vec<f32>> = particles
                 .par_iter()
@@ -187,8 +147,7 @@ impl<'a> Evidence<'a> {
                 .par_iter()
                 .map(|(c, w)| {
                     let pose = chart.pose(c, 1.0);
-                    let (values, slopes) = self.look(&pose, chart.focal, true);
-                    let motions = self.motions(chart, &inverse_base, &slopes, &pose);
+                    let (values, motions) = self.look(chart, &pose);
                     let mut out = Vec::with_capacity(rows * per);
                     let w = *w as f32;
                     for k in 0..free {
@@ -245,7 +204,7 @@ impl<'a> Evidence<'a> {
                 let (next, value) = predict(&trial);
                 let total = value + extra(&trial, stiffness);
                 if total < loss {
-                    improved = loss - total > 1e-4 * loss;
+                    improved = loss - total > 3e-4 * loss;
                     particles = trial;
                     (r, data) = (next, value);
                     damping = (damping * 0.3).max(1e-7);
@@ -262,24 +221,22 @@ impl<'a> Evidence<'a> {
         Tsf::new(chart.focal, poses).unwrap_or_else(|_| tsf.clone())
     }
 
-    /// Derivative of every pixel's value by the chart's coordinates.
-    fn motions(&self, chart: &Chart, base: &[DVec2; 2], slopes: &[[f32; 2]], pose: &Pose) -> Vec<[f32; 5]> {
-        let turn = pose.rotation(chart.focal).inverse();
+    /// Latent irradiance under every pixel as the pose sees it, and its derivatives by the chart's coordinates.
+    fn look(&self, chart: &Chart, pose: &Pose) -> (Vec<f32>, Vec<[f32; 5]>) {
+        let inverse = pose.rotation(chart.focal).inverse();
+        let turn = self.back * inverse;
+        let base = linear_part(&self.back);
         let t = DVec2::new(pose.t_x, pose.t_y);
         self.pixels
             .iter()
-            .zip(slopes)
-            .map(|(q, g)| {
-                // In the frame, or, once the base has taken the point back, in the latent image.
+            .map(|q| {
+                let (v, g) = cubic_with_gradient(self.latent, project(&turn, *q - t) + self.origin);
                 let g = DVec2::new(f64::from(g[0]), f64::from(g[1]));
-                let (gx, gy) = match self.reading {
-                    Reading::Twice => (-g.x, -g.y),
-                    Reading::Cubic => (g.dot(base[0]), g.dot(base[1])),
-                };
-                let p = project(&turn, *q - t);
-                chart.motion(p).map(|m| (-(gx * m.x + gy * m.y)) as f32)
+                let (gx, gy) = (g.dot(base[0]), g.dot(base[1]));
+                // Where the pose moves to, the point that a pixel looks at moves away from.
+                (v, chart.motion(project(&inverse, *q - t)).map(|m| (-(gx * m.x + gy * m.y)) as f32))
             })
-            .collect()
+            .unzip()
     }
 }
 
@@ -304,51 +261,55 @@ fn normal(a: &DMatrix<f32>, b: &[f32]) -> (DMatrix<f64>, DVector<f64>) {
         .reduce(|| (DMatrix::zeros(n, n), DVector::zeros(n)), |(g, c), (g2, c2)| (g + g2, c + c2))
 }
 
-/// Bilinear reading of `plane` at `p` (pixels), the nearest edge pixel outside.
+/// Weights of cubic convolution (Keys 1981, a = -1/2) at fraction `t`.
 #[inline]
-fn linear(plane: &Plane, p: DVec2) -> f32 {
-    let (fx, fy) = (p.x.floor(), p.y.floor());
-    let (u, v) = ((p.x - fx) as f32, (p.y - fy) as f32);
-    let (x, y) = (fx as isize, fy as isize);
-    if x >= 0 && y >= 0 && x + 1 < plane.width as isize && y + 1 < plane.height as isize {
-        let i = y as usize * plane.width + x as usize;
-        let (a, b) = (&plane.data[i..i + 2], &plane.data[i + plane.width..i + plane.width + 2]);
-        return (1.0 - v) * ((1.0 - u) * a[0] + u * a[1]) + v * ((1.0 - u) * b[0] + u * b[1]);
-    }
-    let at = |i: isize, j: isize| plane.clamped(x + i, y + j);
-    (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1))
-}
-
-/// Weights of cubic convolution (a = -1/2) at fraction `t`, and their derivatives by `t`.
-#[inline]
-fn cubic_weights(t: f32) -> ([f32; 4], [f32; 4]) {
+fn cubic_weights(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
-    (
-        [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)],
-        [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)],
-    )
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
-/// Cubic reading of `plane` at `p` (pixels) and its gradient, the nearest edge pixel outside.
+/// Their derivatives.
 #[inline]
-fn cubic(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
+fn cubic_slopes(t: f32) -> [f32; 4] {
+    let t2 = t * t;
+    [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)]
+}
+
+/// The 4 x 4 pixels around `p`, row by row, the nearest edge pixel outside, and the fractions.
+#[inline]
+fn neighbours(plane: &Plane, p: DVec2) -> ([[f32; 4]; 4], f32, f32) {
     let (fx, fy) = (p.x.floor(), p.y.floor());
-    let (wx, gx) = cubic_weights((p.x - fx) as f32);
-    let (wy, gy) = cubic_weights((p.y - fy) as f32);
     let (x, y) = (fx as isize - 1, fy as isize - 1);
     let inside = x >= 0 && y >= 0 && x + 3 < plane.width as isize && y + 3 < plane.height as isize;
-    let (mut v, mut dx, mut dy) = (0.0, 0.0, 0.0);
-    for j in 0..4 {
-        let row: [f32; 4] = if inside {
+    let rows = std::array::from_fn(|j| {
+        if inside {
             let i = (y as usize + j) * plane.width + x as usize;
             [plane.data[i], plane.data[i + 1], plane.data[i + 2], plane.data[i + 3]]
         } else {
             std::array::from_fn(|i| plane.clamped(x + i as isize, y + j as isize))
-        };
-        let along = wx[0] * row[0] + wx[1] * row[1] + wx[2] * row[2] + wx[3] * row[3];
-        v += wy[j] * along;
-        dy += gy[j] * along;
-        dx += wy[j] * (gx[0] * row[0] + gx[1] * row[1] + gx[2] * row[2] + gx[3] * row[3]);
-    }
-    (v, [dx, dy])
+        }
+    });
+    (rows, (p.x - fx) as f32, (p.y - fy) as f32)
+}
+
+fn along(w: &[f32; 4], row: &[f32; 4]) -> f32 {
+    w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]
+}
+
+/// Cubic reading of `plane` at `p` (pixels).
+#[inline]
+fn cubic(plane: &Plane, p: DVec2) -> f32 {
+    let (rows, u, v) = neighbours(plane, p);
+    let (wx, wy) = (cubic_weights(u), cubic_weights(v));
+    along(&wy, &rows.map(|r| along(&wx, &r)))
+}
+
+/// Cubic reading of `plane` at `p` (pixels) and its gradient.
+#[inline]
+fn cubic_with_gradient(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
+    let (rows, u, v) = neighbours(plane, p);
+    let (wx, wy) = (cubic_weights(u), cubic_weights(v));
+    let values = rows.map(|r| along(&wx, &r));
+    let gx = cubic_slopes(u);
+    (along(&wy, &values), [along(&wy, &rows.map(|r| along(&gx, &r))), along(&cubic_slopes(v), &values)])
 }

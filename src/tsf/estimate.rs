@@ -7,10 +7,9 @@ use super::Tsf;
 use super::continuous::Evidence;
 use super::from_psfs::nominal_focal;
 use super::model::{Chart, Coordinates, Model};
-use super::taps::Interpolation;
 use super::whole_frame::{Row, WholeFrame};
 use crate::image::Plane;
-use crate::pose::{Pose, PoseGrid};
+use crate::pose::{Pose, PoseGrid, project};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -22,8 +21,6 @@ pub struct Search {
     pub model: Model,
     /// Focal length in pixels; `None`: found where pitch and yaw show it, else 1.2 times the longer side.
     pub focal_px: Option<f64>,
-    /// Interpolation under which the TSF will be used.
-    pub interpolation: Interpolation,
 }
 
 /// A model that was tried.
@@ -54,10 +51,22 @@ pub struct Estimate {
     pub scale: usize,
     /// Mean squared residual over variance of the differences that count.
     pub residual: f64,
+    /// By how much the TSF lowers the squared residual, in units of the noise, per number that it has: about 1 where it explains noise alone.
+    pub evidence: f64,
 }
 
+impl Estimate {
+    /// Whether the frame has enough texture, seen well enough, to tell its blur.
+    pub fn is_sound(&self) -> bool {
+        self.evidence > EVIDENCE
+    }
+}
+
+/// Least [`Estimate::evidence`] of a TSF that says something: noise alone reaches 1 to 2.
+const EVIDENCE: f64 = 6.0;
+
 /// Differences that the continuous poses are fitted to.
-const ROWS: usize = 16_000;
+const ROWS: usize = 14_000;
 /// Shorter side in pixels below which a level holds too little to see.
 const SMALLEST: usize = 56;
 /// Largest translation of the coarsest grid in its pixels.
@@ -69,7 +78,9 @@ const FINEST_EXTENT: f64 = 48.0;
 /// Sides of the blocks that are held out, as a part of the longer side.
 const BLOCKS: usize = 14;
 /// Focal lengths tried, times the longer side: from a wide lens to a short telephoto lens.
-const FOCALS: [f64; 5] = [0.6, 0.85, 1.2, 1.7, 2.4];
+const FOCALS: [f64; 4] = [0.6, 0.85, 1.7, 2.4];
+/// Iterations of a trial: the start is near.
+const TRIAL: usize = 4;
 
 /// A level of the pyramid.
 struct Level {
@@ -85,12 +96,15 @@ impl Level {
         WholeFrame { latent: &self.latent, pad: self.pad, blurred: &self.blurred, weight: &self.weight, base: self.base }
     }
 
-    /// Half the size. `pad` has to be even.
+    /// Half the size.
     fn half(frame: &WholeFrame) -> Self {
+        // An odd pad would put the frame between the pixels of the halved latent image.
+        let cut = frame.pad % 2;
+        let cropped = (cut > 0).then(|| frame.latent.crop(cut, cut, frame.latent.width - 2 * cut, frame.latent.height - 2 * cut));
         let s = DMat3::from_diagonal(DVec3::new(0.5, 0.5, 1.0));
         let variance = frame.weight.map(|w| if w > 0.0 { 1.0 / w } else { f32::INFINITY });
         Self {
-            latent: halve(frame.latent),
+            latent: halve(cropped.as_ref().unwrap_or(frame.latent)),
             pad: frame.pad / 2,
             blurred: halve(frame.blurred),
             // Squared weights of the filter sum to (20/64)² instead of 1: white noise falls, a masked pixel masks all it touches.
@@ -127,6 +141,22 @@ pub fn extent(tsf: &Tsf, width: usize, height: usize) -> f64 {
         worst = worst.max((hi - lo).max_element());
     }
     worst
+}
+
+/// Whole pixels u = p - Γ⁻¹ p near which the PSF at the frame's pixel `p` of a `size` frame has its values.
+pub fn path_at(tsf: &Tsf, p: (f64, f64), size: (usize, usize)) -> Vec<(isize, isize)> {
+    let p = glam::DVec2::new(p.0 - (size.0 as f64 - 1.0) / 2.0, p.1 - (size.1 as f64 - 1.0) / 2.0);
+    let mut path: Vec<(isize, isize)> = tsf
+        .poses
+        .iter()
+        .map(|pose| {
+            let u = p - project(&pose.homography(tsf.focal_px).inverse(), p);
+            (u.x.round() as isize, u.y.round() as isize)
+        })
+        .collect();
+    path.sort_unstable();
+    path.dedup();
+    path
 }
 
 /// Farthest that any pose takes a corner or the centre, pixels.
@@ -206,16 +236,8 @@ impl WholeFrame<'_> {
         while w.min(h) >> (count + 1) >= SMALLEST {
             count += 1;
         }
-        let pad = self.pad >> count << count;
-        let cut = self.pad - pad;
-        let cropped = (cut > 0).then(|| self.latent.crop(cut, cut, w + 2 * pad, h + 2 * pad));
-        let top = WholeFrame { latent: cropped.as_ref().unwrap_or(self.latent), pad, ..*self };
-        let mut levels: Vec<Level> = Vec::new();
-        for k in 0..count {
-            let next = Level::half(&if k == 0 { WholeFrame { ..top } } else { levels[k - 1].frame() });
-            levels.push(next);
-        }
-        let level = |l: usize| if l == 0 { WholeFrame { ..top } } else { levels[l - 1].frame() };
+        let levels = self.levels(count);
+        let level = |l: usize| if l == 0 { WholeFrame { ..*self } } else { levels[l - 1].frame() };
 
         let focal = search.focal_px.unwrap_or_else(|| nominal_focal(w, h));
         let coarse = level(count);
@@ -235,75 +257,141 @@ impl WholeFrame<'_> {
             let margin = margin(&here, (fw, fh));
             if l < count {
                 let rows = frame.rows(ROWS / 2, margin);
-                here = Evidence::new(&frame, &rows, Interpolation::Bicubic).weigh(&around(&here, &chart, 1.0), chart.focal)?;
+                here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal)?;
             }
             here = gathered(&here, &chart, GATHER, MOST)?;
             let rows = frame.rows(ROWS, margin);
-            here = Evidence::new(&frame, &rows, search.interpolation).refine(&here, &chart, if l == 0 { 12 } else { 6 });
+            here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
             tsf = scaled(&here, scale);
             if l == 0 || extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
                 break;
             }
             l -= 1;
         }
-        Some(self.choose(&level(l), l, &tsf, focal, search))
+        Some(choose(&level(l), l, &tsf, focal, search))
     }
 
-    /// The model of the TSF, and the TSF within it, from the planar `tsf` at level `l`.
-    fn choose(&self, frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) -> Estimate {
-        let scale = (1 << l) as f64;
-        let (w, h) = frame.size();
-        let start = scaled(tsf, 1.0 / scale);
-        let all = frame.rows(ROWS, margin(&start, (w, h)));
-        let fit = |rows: &[Row], model: Model, focal: f64, from: &Tsf, iterations: usize| {
-            Evidence::new(frame, rows, search.interpolation).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
+    /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model.
+    pub fn refine(&self, tsf: &Tsf) -> Tsf {
+        let (w, h) = self.size();
+        let mut l = 0;
+        while extent(tsf, w, h) > FINEST_EXTENT * f64::from(1 << l) && w.min(h) >> (l + 1) >= SMALLEST {
+            l += 1;
+        }
+        let levels = self.levels(l);
+        let frame = if l == 0 { WholeFrame { ..*self } } else { levels[l - 1].frame() };
+        let scale = f64::from(1 << l);
+        let size = frame.size();
+        let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
+        let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart, GATHER, MOST) else { return tsf.clone() };
+        let rows = frame.rows(ROWS, margin(&start, size));
+        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale)
+    }
+
+    /// The coarser levels of the pyramid: 1/2, 1/4, ...
+    fn levels(&self, count: usize) -> Vec<Level> {
+        let mut levels: Vec<Level> = Vec::new();
+        for _ in 0..count {
+            let next = Level::half(&levels.last().map_or(WholeFrame { ..*self }, Level::frame));
+            levels.push(next);
+        }
+        levels
+    }
+}
+
+/// The model of the TSF, and the TSF within it, from the planar `tsf` at level `l`.
+fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) -> Estimate {
+    let scale = (1 << l) as f64;
+    let (w, h) = frame.size();
+    let start = scaled(tsf, 1.0 / scale);
+    let all = frame.rows(ROWS, margin(&start, (w, h)));
+    let fit = |rows: &[Row], model: Model, focal: f64, from: &Tsf, iterations: usize| {
+        Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
+    };
+    let block = w.max(h).div_ceil(BLOCKS);
+    let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13) % 5 == 0;
+    let mut trials = Vec::new();
+    let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
+    if search.model == Model::Auto {
+        let (outside, inside): (Vec<Row>, Vec<Row>) = all.iter().partition(|r| held(r));
+        let judge = Evidence::new(frame, &outside);
+        let mut tried: Vec<(Model, f64, Vec<(usize, f64)>)> = Vec::new();
+        let mut attempt = |model: Model, focal: f64| {
+            let t = fit(&inside, model, focal, &start, TRIAL);
+            let r = judge.residual(&t);
+            let blocks = outside.iter().zip(&r).map(|(o, v)| (o.y as usize / block * 1000 + o.x as usize / block, f64::from(*v).powi(2)));
+            let blocks: Vec<(usize, f64)> = blocks.collect();
+            tried.push((model, focal, blocks.clone()));
+            blocks
         };
-        let block = w.max(h).div_ceil(BLOCKS);
-        let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13) % 5 == 0;
-        let mut trials = Vec::new();
-        let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
-        if search.model == Model::Auto {
-            let (outside, inside): (Vec<Row>, Vec<Row>) = all.iter().partition(|r| held(r));
-            let judge = Evidence::new(frame, &outside, search.interpolation);
-            let mut tried: Vec<(Model, f64, Vec<(usize, f64)>)> = Vec::new();
-            let mut attempt = |model: Model, focal: f64| {
-                let t = fit(&inside, model, focal, &start, 8);
-                let r = judge.residual(&t);
-                let blocks =
-                    outside.iter().zip(&r).map(|(o, v)| (o.y as usize / block * 1000 + o.x as usize / block, f64::from(*v).powi(2)));
-                tried.push((model, focal, blocks.collect()));
-            };
-            for m in [Model::Translation, Model::Rigid, Model::Full] {
-                attempt(m, focal);
-            }
-            if search.focal_px.is_some() {
-                attempt(Model::Rotation, focal);
-            } else {
-                for f in FOCALS {
-                    attempt(Model::Rotation, f * w.max(h) as f64 * scale);
-                }
-            }
-            let mean = |t: &[(usize, f64)]| t.iter().map(|v| v.1).sum::<f64>() / t.len().max(1) as f64;
-            let best = tried.iter().min_by(|a, b| mean(&a.2).total_cmp(&mean(&b.2))).expect("several models are tried").clone();
-            for (m, f, r) in &tried {
-                trials.push(Trial { model: *m, focal_px: *f, held_out: mean(r), worse_by: standard_errors(r, &best.2) });
-            }
-            // The simplest that is not clearly worse; among focal lengths the default, unless another is clearly better.
-            let order = [Model::Translation, Model::Rigid, Model::Rotation, Model::Full];
-            model = order.into_iter().find(|m| trials.iter().any(|t| t.model == *m && t.worse_by < WORSE)).unwrap_or(best.0);
-            if model == Model::Rotation && search.focal_px.is_none() {
-                let of = |f: f64| trials.iter().find(|t| t.model == Model::Rotation && (t.focal_px - f).abs() < 1e-6 * f);
-                if of(focal).is_none_or(|t| t.worse_by >= WORSE) {
-                    let rotations = trials.iter().filter(|t| t.model == Model::Rotation);
-                    chosen_focal = rotations.min_by(|a, b| a.held_out.total_cmp(&b.held_out)).map_or(focal, |t| t.focal_px);
-                    source = "found";
-                }
+        attempt(Model::Translation, focal);
+        let rigid = attempt(Model::Rigid, focal);
+        let turned = attempt(Model::Rotation, focal);
+        let full = attempt(Model::Full, focal);
+        // Other focal lengths only where perspective shows at all: otherwise none can be told from another.
+        let seen = standard_errors(&rigid, &turned) > WORSE || standard_errors(&rigid, &full) > WORSE;
+        if search.focal_px.is_none() && seen {
+            for f in FOCALS {
+                attempt(Model::Rotation, f * w.max(h) as f64 * scale);
             }
         }
-        let here = fit(&all, model, chosen_focal, &start, 15);
-        let r = Evidence::new(frame, &all, search.interpolation).residual(&here);
-        let residual = r.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / r.len().max(1) as f64;
-        Estimate { tsf: scaled(&here, scale), model, focal: source, trials, scale: 1 << l, residual }
+        let mean = |t: &[(usize, f64)]| t.iter().map(|v| v.1).sum::<f64>() / t.len().max(1) as f64;
+        let best = tried.iter().min_by(|a, b| mean(&a.2).total_cmp(&mean(&b.2))).expect("several models are tried").clone();
+        for (m, f, r) in &tried {
+            trials.push(Trial { model: *m, focal_px: *f, held_out: mean(r), worse_by: standard_errors(r, &best.2) });
+        }
+        // The simplest that is not clearly worse; among focal lengths the default, unless another is clearly better.
+        let order = [Model::Translation, Model::Rigid, Model::Rotation, Model::Full];
+        model = order.into_iter().find(|m| trials.iter().any(|t| t.model == *m && t.worse_by < WORSE)).unwrap_or(best.0);
+        if model == Model::Rotation && search.focal_px.is_none() {
+            let of = |f: f64| trials.iter().find(|t| t.model == Model::Rotation && (t.focal_px - f).abs() < 1e-6 * f);
+            if of(focal).is_none_or(|t| t.worse_by >= WORSE) {
+                let rotations = trials.iter().filter(|t| t.model == Model::Rotation);
+                chosen_focal = rotations.min_by(|a, b| a.held_out.total_cmp(&b.held_out)).map_or(focal, |t| t.focal_px);
+                source = "found";
+            }
+        }
+    }
+    let here = fit(&all, model, chosen_focal, &start, 10);
+    let evidence = Evidence::new(frame, &all);
+    let energy = |r: &[f32]| r.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+    let left = energy(&evidence.residual(&here));
+    let residual = left / all.len().max(1) as f64;
+    let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
+    let evidence = (energy(evidence.targets()) - left) / numbers as f64;
+    Estimate { tsf: filled(&here, scale), model, focal: source, trials, scale: 1 << l, residual, evidence }
+}
+
+/// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.
+fn filled(tsf: &Tsf, factor: f64) -> Tsf {
+    let mut out = scaled(tsf, factor);
+    let n = factor as i32;
+    if n > 1 {
+        let tent = |k: i32| f64::from(n - k.abs()) / f64::from(n * n);
+        let spread = |p: &Pose| {
+            let p = *p;
+            (1 - n..n).flat_map(move |j| {
+                (1 - n..n).map(move |i| Pose {
+                    t_x: p.t_x + f64::from(i),
+                    t_y: p.t_y + f64::from(j),
+                    weight: p.weight * tent(i) * tent(j),
+                    ..p
+                })
+            })
+        };
+        out.poses = out.poses.iter().flat_map(spread).collect();
+    }
+    out
+}
+
+/// The narrowest model that holds all poses of `tsf`.
+fn model_of(tsf: &Tsf) -> Model {
+    let any = |f: fn(&Pose) -> f64| tsf.poses.iter().any(|p| f(p).abs() > 1e-9);
+    match (any(|p| p.theta_x_deg) || any(|p| p.theta_y_deg), any(|p| p.t_x) || any(|p| p.t_y)) {
+        (true, true) => Model::Full,
+        (true, false) => Model::Rotation,
+        (false, _) if any(|p| p.theta_z_deg) => Model::Rigid,
+        (false, _) => Model::Translation,
     }
 }
 

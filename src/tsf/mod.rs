@@ -8,7 +8,7 @@ mod model;
 mod taps;
 mod whole_frame;
 
-pub use estimate::{Estimate, Search, Trial, extent};
+pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
 pub use model::Model;
 pub use taps::{Interpolation, Tap, TapSet};
