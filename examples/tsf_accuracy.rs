@@ -52,8 +52,8 @@ fn direct(e: &Plane, t: &Tsf, kind: Interpolation) -> Plane {
     out
 }
 
-fn solver(e: &Plane, t: &Tsf, kind: Interpolation) -> (Plane, usize, usize) {
-    let taps = TapSet::new(t, e.width, e.height, kind);
+fn solver(e: &Plane, t: &Tsf, kind: Interpolation, fine: usize) -> (Plane, usize, usize) {
+    let taps = TapSet::new(t, e.width * fine, e.height * fine, kind);
     let m = taps.taps.iter().map(|t| t.dx.abs().max(t.dy.abs())).max().unwrap() as usize;
     let mut out = Plane::filled(e.width, e.height, 0.0);
     for (b, h) in taps.bases.iter().enumerate() {
@@ -161,20 +161,28 @@ fn main() {
             };
             let report = |name: &str, t: &Tsf, seconds: f64| {
                 let c = direct(&truth, t, Interpolation::Bicubic);
-                let (b, _, _) = solver(&truth, t, Interpolation::Bilinear);
-                let (s, bases, taps) = solver(&truth, t, Interpolation::Bicubic);
-                println!(
-                    "{:20} {i} {name:9} poses {:3} | exact {:.2}% irr {:.2}% chi2 {:.2} | bicubic taps {:.2}% chi2 {:.2} ({bases} bases {taps} taps) | bilinear taps {:.2}% chi2 {:.2} | {seconds:.1}s",
+                let mut line = format!(
+                    "{:20} {i} {name:6} poses {:3} | exact {:.2}% irr {:.2}% chi2 {:.2}",
                     dir.file_name().unwrap().to_string_lossy(),
                     t.poses.len(),
                     err(&c, &k_true),
                     err(&c, &irr),
-                    chi(&c),
-                    err(&s, &k_true),
-                    chi(&s),
-                    err(&b, &k_true),
-                    chi(&b),
+                    chi(&c)
                 );
+                for (label, kind, fine) in [
+                    ("bil", Interpolation::Bilinear, 1),
+                    ("cub", Interpolation::Bicubic, 1),
+                    ("cub/2", Interpolation::Bicubic, 2),
+                    ("cub/8", Interpolation::Bicubic, 8),
+                    ("six/2", Interpolation::SixPoint, 2),
+                ] {
+                    if !what.contains("taps") && label != "cub" {
+                        continue;
+                    }
+                    let (s, bases, taps) = solver(&truth, t, kind, fine);
+                    line += &format!(" | {label} {:.2}% chi2 {:.2} ({bases}b {taps}t)", err(&s, &k_true), chi(&s));
+                }
+                println!("{line} | {seconds:.1}s");
             };
             if what.contains("true") {
                 report("true", &t_true, 0.0);

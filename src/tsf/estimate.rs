@@ -32,7 +32,7 @@ pub struct Trial {
     pub focal_px: f64,
     /// Mean squared residual over variance (noise and expected operator error) of the differences that it was not fitted to.
     pub held_out: f64,
-    /// How much worse than the best trial, in standard errors of the difference over blocks of the frame.
+    /// How much worse than the best trial: mean logarithm of the ratio of squared residuals over blocks of the frame.
     pub worse_by: f64,
 }
 
@@ -329,27 +329,30 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         let turned = attempt(Model::Rotation, focal);
         let full = attempt(Model::Full, focal);
         // Other focal lengths only where perspective shows at all: otherwise none can be told from another.
-        let seen = standard_errors(&rigid, &turned) > WORSE || standard_errors(&rigid, &full) > WORSE;
+        let seen = !Worse::than(&rigid, &turned).forgivable() || !Worse::than(&rigid, &full).forgivable();
         if search.focal_px.is_none() && seen {
             for f in FOCALS {
                 attempt(Model::Rotation, f * w.max(h) as f64 * scale);
             }
         }
         let mean = |t: &[(usize, f64)]| t.iter().map(|v| v.1).sum::<f64>() / t.len().max(1) as f64;
-        let best = tried.iter().min_by(|a, b| mean(&a.2).total_cmp(&mean(&b.2))).expect("several models are tried").clone();
+        let better = |a: &[(usize, f64)], b: &[(usize, f64)]| Worse::than(a, b).by.total_cmp(&0.0);
+        let best = tried.iter().min_by(|a, b| better(&a.2, &b.2)).expect("several models are tried").clone();
+        let mut forgiven: Vec<(Model, f64)> = Vec::new();
         for (m, f, r) in &tried {
-            trials.push(Trial { model: *m, focal_px: *f, held_out: mean(r), worse_by: standard_errors(r, &best.2) });
+            let worse = Worse::than(r, &best.2);
+            trials.push(Trial { model: *m, focal_px: *f, held_out: mean(r), worse_by: worse.by });
+            if worse.forgivable() {
+                forgiven.push((*m, *f));
+            }
         }
         // The simplest that is not clearly worse; among focal lengths the default, unless another is clearly better.
         let order = [Model::Translation, Model::Rigid, Model::Rotation, Model::Full];
-        model = order.into_iter().find(|m| trials.iter().any(|t| t.model == *m && t.worse_by < WORSE)).unwrap_or(best.0);
-        if model == Model::Rotation && search.focal_px.is_none() {
-            let of = |f: f64| trials.iter().find(|t| t.model == Model::Rotation && (t.focal_px - f).abs() < 1e-6 * f);
-            if of(focal).is_none_or(|t| t.worse_by >= WORSE) {
-                let rotations = trials.iter().filter(|t| t.model == Model::Rotation);
-                chosen_focal = rotations.min_by(|a, b| a.held_out.total_cmp(&b.held_out)).map_or(focal, |t| t.focal_px);
-                source = "found";
-            }
+        model = order.into_iter().find(|m| forgiven.iter().any(|t| t.0 == *m)).unwrap_or(best.0);
+        if model == Model::Rotation && !forgiven.contains(&(Model::Rotation, focal)) {
+            let rotations = trials.iter().filter(|t| t.model == Model::Rotation);
+            chosen_focal = rotations.min_by(|a, b| a.worse_by.total_cmp(&b.worse_by)).map_or(focal, |t| t.focal_px);
+            source = "found";
         }
     }
     let here = fit(&all, model, chosen_focal, &start, 10);
@@ -395,19 +398,36 @@ fn model_of(tsf: &Tsf) -> Model {
     }
 }
 
-/// Standard errors by which a model may be worse than the best and still be taken for its simplicity.
-const WORSE: f64 = 2.0;
+/// How much worse a model explains held-out differences than another: the mean over blocks of the logarithm of the ratio of their squared
+/// residuals (a sum over the frame would speak of its brightest edges alone), and that in standard errors.
+#[derive(Clone, Copy)]
+struct Worse {
+    by: f64,
+    errors: f64,
+}
 
-/// Mean difference of two models' squared residuals over blocks, in standard errors.
-fn standard_errors(a: &[(usize, f64)], b: &[(usize, f64)]) -> f64 {
-    let mut blocks: BTreeMap<usize, f64> = BTreeMap::new();
-    for (x, y) in a.iter().zip(b) {
-        *blocks.entry(x.0).or_default() += x.1 - y.1;
+impl Worse {
+    fn than(a: &[(usize, f64)], b: &[(usize, f64)]) -> Self {
+        let mut blocks: BTreeMap<usize, (f64, f64, f64)> = BTreeMap::new();
+        for (x, y) in a.iter().zip(b) {
+            let block = blocks.entry(x.0).or_default();
+            *block = (block.0 + x.1, block.1 + y.1, block.2 + 1.0);
+        }
+        // A tenth of the noise: blocks that are explained better than that say nothing more.
+        let ratios: Vec<f64> = blocks.values().filter(|b| b.2 >= 8.0).map(|b| ((b.0 + 0.1 * b.2) / (b.1 + 0.1 * b.2)).ln()).collect();
+        let n = ratios.len() as f64;
+        if n < 2.0 {
+            return Self { by: 0.0, errors: 0.0 };
+        }
+        let mean = ratios.iter().sum::<f64>() / n;
+        let variance = ratios.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0);
+        Self { by: mean, errors: if variance > 0.0 { mean / (variance / n).sqrt() } else { 0.0 } }
     }
-    let n = blocks.len() as f64;
-    let mean = blocks.values().sum::<f64>() / n.max(1.0);
-    let variance = blocks.values().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-    if variance > 0.0 { mean / (variance / n).sqrt() } else { 0.0 }
+
+    /// Whether the simpler model may be taken all the same: less than a per cent is nothing, up to 8 % if it may be chance.
+    fn forgivable(self) -> bool {
+        self.by < 0.01 || self.by < 0.08 && self.errors < 2.0
+    }
 }
 
 /// Pixels from the border within which a pose looks beyond the frame, at most a fifth of the shorter side.

@@ -13,11 +13,10 @@ use std::collections::BTreeMap;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Interpolation {
-    /// Two taps per axis: the default. With poses refined under the same interpolation it measures as well as the longer kernels (39.5 dB
-    /// against 39.1 dB for bicubic on a 226 x 341 bracket) at half the time.
-    #[default]
+    /// Two taps per axis. Fast, and itself a blur: with the true poses the operator is off by 1.5 to 3.7 % of the blurred image.
     Bilinear,
-    /// Four taps per axis: cubic convolution (Keys 1981, a = -1/2).
+    /// Four taps per axis: cubic convolution (Keys 1981, a = -1/2). The default; TSFs are estimated under it.
+    #[default]
     Bicubic,
     /// Six taps per axis: Keys' cubic convolution of fourth order.
     SixPoint,
