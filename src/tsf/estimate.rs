@@ -217,14 +217,23 @@ fn around(tsf: &Tsf, chart: &Chart, step: f64) -> Vec<Pose> {
     seen.values().map(|c| chart.pose(c, 1.0)).collect()
 }
 
-fn gathered(tsf: &Tsf, chart: &Chart, radius: f64, most: usize) -> Option<Tsf> {
-    let mut particles: Vec<(Coordinates, f64)> = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
-    gather(&mut particles, radius, most);
+/// Continuous poses for the lattice poses of `tsf`: as close together as their number allows.
+fn gathered(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
+    let mut particles = Vec::new();
+    for radius in GATHER {
+        particles = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
+        gather(&mut particles, radius, MOST);
+        if particles.len() <= FEW {
+            break;
+        }
+    }
     Tsf::new(chart.focal, particles.iter().map(|(c, w)| chart.pose(c, *w)).collect()).ok()
 }
 
-/// Distance in pixels within which lattice poses become one continuous pose: closer ones could not be told apart.
-const GATHER: f64 = 1.2;
+/// Distances in pixels within which lattice poses become one continuous pose: the first that leaves few, else the last.
+const GATHER: [f64; 3] = [0.7, 0.9, 1.2];
+/// So few continuous poses are refined in no time.
+const FEW: usize = 50;
 /// Continuous poses at most.
 const MOST: usize = 250;
 
@@ -259,7 +268,7 @@ impl WholeFrame<'_> {
                 let rows = frame.rows(ROWS / 2, margin);
                 here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal)?;
             }
-            here = gathered(&here, &chart, GATHER, MOST)?;
+            here = gathered(&here, &chart)?;
             let rows = frame.rows(ROWS, margin);
             here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
             tsf = scaled(&here, scale);
@@ -283,7 +292,7 @@ impl WholeFrame<'_> {
         let scale = f64::from(1 << l);
         let size = frame.size();
         let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
-        let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart, GATHER, MOST) else { return tsf.clone() };
+        let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart) else { return tsf.clone() };
         let rows = frame.rows(ROWS, margin(&start, size));
         filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale)
     }

@@ -11,7 +11,7 @@ const SIZE: (usize, usize) = (160, 120);
 const PAD: usize = 16;
 const KERNEL: Interpolation = Interpolation::Bicubic;
 /// Standard deviation of the noise: the texture's is about 0.15.
-const NOISE: f32 = 0.006;
+const NOISE: f32 = 0.01;
 
 /// The frame that `tsf` makes of `latent` (which surrounds it by `pad`), by direct summation over poses, cubic convolution.
 fn blur(latent: &Plane, pad: usize, tsf: &Tsf, size: (usize, usize)) -> Plane {
@@ -47,6 +47,15 @@ fn operator_error(latent: &Plane, pad: usize, found: &Tsf, truth: &Tsf, size: (u
     inner(&|i| f64::from(p.data[i] - q.data[i]).powi(2)) / inner(&|i| f64::from(p.data[i] - e.data[i]).powi(2))
 }
 
+/// Texture as a lens leaves it: nothing as fine as the pixels.
+fn seen(width: usize, height: usize) -> Plane {
+    let sharp = texture(width, height);
+    Plane::from_fn(width, height, |x, y| {
+        let at = |i: isize, j: isize| sharp.clamped(x as isize + i, y as isize + j);
+        (at(0, 0) * 4.0 + 2.0 * (at(1, 0) + at(-1, 0) + at(0, 1) + at(0, -1)) + at(1, 1) + at(-1, 1) + at(1, -1) + at(-1, -1)) / 16.0
+    })
+}
+
 /// A camera path as a TSF: `at` of equal steps of time from -1/2 to 1/2.
 fn path(focal_px: f64, at: impl Fn(f64) -> Pose) -> Tsf {
     Tsf::new(focal_px, (0..60).map(|i| at((f64::from(i) + 0.5) / 60.0 - 0.5)).collect()).unwrap()
@@ -67,7 +76,7 @@ fn search(model: Model, focal_px: Option<f64>) -> Search {
 
 #[test]
 fn every_model_finds_motion_between_the_poses_of_a_grid() {
-    let latent = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let latent = seen(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let f = 100.0;
     let bend = |t: f64| (3.0 * t).sin();
     for (model, truth) in [
@@ -80,9 +89,9 @@ fn every_model_finds_motion_between_the_poses_of_a_grid() {
         let frame = WholeFrame { latent: &latent, pad: PAD, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
         let found = frame.estimate(&search(model, Some(f))).expect("texture determines it");
         let error = operator_error(&latent, PAD, &found.tsf, &truth, SIZE);
-        assert!(error < 0.05, "{}: operator error {error:.3}, residual {:.2}", model.name(), found.residual);
+        assert!(error < 0.08, "{}: operator error {error:.3}, residual {:.2}", model.name(), found.residual);
         assert!(found.is_sound(), "{}: evidence {:.1}", model.name(), found.evidence);
-        assert!((0.8..2.0).contains(&found.residual), "{}: residual {:.2} of the noise", model.name(), found.residual);
+        assert!((0.7..3.0).contains(&found.residual), "{}: residual {:.2} of the noise", model.name(), found.residual);
         assert!((found.tsf.poses.iter().map(|p| p.weight).sum::<f64>() - 1.0).abs() < 1e-9);
         // A narrower model does not reach this: the test can tell them apart.
         if model != Model::Translation {
@@ -104,7 +113,7 @@ fn every_model_finds_motion_between_the_poses_of_a_grid() {
 
 #[test]
 fn the_simplest_model_that_explains_the_frame_is_taken() {
-    let latent = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let latent = seen(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let f = 100.0;
     for (expected, truth) in [
         (&[Model::Translation][..], path(f, |t| Pose::planar(6.0 * t, 3.0 * t * t, 0.0, 1.0))),
@@ -117,7 +126,7 @@ fn the_simplest_model_that_explains_the_frame_is_taken() {
         let found = frame.estimate(&search(Model::Auto, None)).expect("texture determines it");
         assert!(expected.contains(&found.model), "{:?}, expected {expected:?}: {:#?}", found.model, found.trials);
         let best = found.trials.iter().map(|t| t.held_out).fold(f64::INFINITY, f64::min);
-        assert!((0.7..2.0).contains(&best), "held-out residual {best:.2} of the noise");
+        assert!((0.7..3.0).contains(&best), "held-out residual {best:.2} of the noise");
         if found.model == Model::Rotation {
             assert_eq!((found.focal, found.tsf.focal_px), ("found", 96.0));
         }
@@ -146,7 +155,7 @@ fn blur_of_three_and_of_fifty_pixels_is_found() {
 #[test]
 fn a_frame_that_lies_elsewhere_is_searched_from_there() {
     let pad = 40;
-    let latent = texture(SIZE.0 + 2 * pad, SIZE.1 + 2 * pad);
+    let latent = seen(SIZE.0 + 2 * pad, SIZE.1 + 2 * pad);
     let base = Pose::planar(21.0, -17.0, 3.0, 1.0).homography(200.0);
     let moving = path(200.0, |t| Pose::planar(5.0 * t, 2.0 * t, 0.5 * t, 1.0));
     // Γ A for a planar A is planar: its translation is what Γ makes of A's.
@@ -167,7 +176,7 @@ fn a_frame_that_lies_elsewhere_is_searched_from_there() {
 
 #[test]
 fn refinement_brings_a_rough_tsf_home() {
-    let latent = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let latent = seen(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let truth = path(200.0, |t| Pose::planar(5.0 * t + 0.4, 3.0 * t * t, t, 1.0));
     let (blurred, weight) = shaken(&latent, PAD, &truth, SIZE);
     let frame = WholeFrame { latent: &latent, pad: PAD, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
@@ -188,8 +197,8 @@ fn without_texture_there_is_no_sound_tsf() {
     let (blurred, weight) = shaken(&latent, 0, &path(200.0, |t| Pose::planar(5.0 * t, 0.0, 0.0, 1.0)), SIZE);
     // The sharp frames are noisy as well.
     let n = numbers(5, SIZE.0 * SIZE.1);
-    let seen = Plane { data: n.iter().map(|n| 2.0 + NOISE * n).collect(), ..latent };
-    let frame = WholeFrame { latent: &seen, pad: 0, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
+    let noisy = Plane { data: n.iter().map(|n| 2.0 + NOISE * n).collect(), ..latent };
+    let frame = WholeFrame { latent: &noisy, pad: 0, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
     let found = frame.estimate(&search(Model::Rigid, None));
     assert!(!found.as_ref().is_some_and(tsf::Estimate::is_sound), "evidence {:.1}", found.unwrap().evidence);
 }
