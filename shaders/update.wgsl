@@ -1,5 +1,7 @@
-// Trial step of log irradiance, u = u_old + clamp(s x, -1, 1), and E = exp(u), for one channel. s = 0 restores.
-// The clamp comes after s: for small s the step is then s x itself, which lowers the objective; a clamped x need not.
+// Trial step of log irradiance and E = exp(u), for one channel. s = 0 restores. The data term is quadratic in E, not in u:
+// upwards E grows by the factor 1 + s x, where exp(s x) would overshoot; downwards by exp(s x), which stays positive.
+// Both are s x to first order. A pixel at most quadruples, and falls to no less than 1 / e. The bounds come after s: for
+// small s the step is then s x itself, which lowers the objective; a bounded x need not.
 struct Params {
     count: u32,
     row: u32,
@@ -17,7 +19,8 @@ struct Params {
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
     let i = (group.y * params.row + group.x) * 128u + local;
     if i < params.count {
-        let u = old[i] + clamp(params.step * solution[i], -1.0, 1.0);
+        let x = params.step * solution[i];
+        let u = old[i] + select(max(x, -1.0), log(1.0 + clamp(x, 0.0, 3.0)), x > 0.0);
         log_irradiance[i] = u;
         irradiance[i] = exp(u);
     }

@@ -30,6 +30,7 @@ mod nonnegative;
 pub mod pipeline;
 pub mod pose;
 pub mod psf;
+pub mod register;
 pub mod response;
 pub mod synth;
 pub mod tonemap;

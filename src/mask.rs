@@ -2,6 +2,8 @@
 
 use crate::exposure::Frame;
 use crate::image::Plane;
+use crate::pose::nearest_pixel;
+use glam::DMat3;
 
 /// Intensity from which a channel counts as clipped: the well clips after the noise, so that values just below white are
 /// already biased. 250 of 255.
@@ -34,7 +36,9 @@ pub fn clipped(frame: &Frame) -> Vec<bool> {
 /// The window's high end applies everywhere, and the mask is 0 wherever any channel is clipped. Its low end applies only where
 /// a longer frame that is at least as sharp has the pixel in the flat part of its own window: elsewhere the dark values are
 /// the best there is, and their variance already says what they are worth (the low end alone costs 3 dB).
-pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32) -> Vec<Plane> {
+///
+/// `motions`: each frame's place, from the reference, centred pixels.
+pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3]) -> Vec<Plane> {
     let greys: Vec<Plane> = frames.iter().map(grey).collect();
     let clipped: Vec<Vec<bool>> = frames.iter().map(clipped).collect();
     frames
@@ -43,13 +47,19 @@ pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32) -> Vec<Plane> {
         .map(|(i, f)| {
             let better: Vec<usize> =
                 (0..frames.len()).filter(|&j| frames[j].exposure_time > 1.001 * f.exposure_time && (sharp[j] || !sharp[i])).collect();
+            let (w, h) = f.intensity.size();
+            let to: Vec<(usize, Option<DMat3>)> =
+                better.into_iter().map(|j| (j, (motions[j] != motions[i]).then(|| motions[j] * motions[i].inverse()))).collect();
             let data = (0..greys[i].data.len())
                 .map(|p| {
                     if clipped[i][p] {
                         return 0.0;
                     }
                     let z = greys[i].data[p];
-                    let covered = better.iter().any(|&j| !clipped[j][p] && tukey(greys[j].data[p], alpha) >= 1.0);
+                    let covered = to.iter().any(|(j, motion)| {
+                        let there = motion.map_or(Some(p), |m| nearest_pixel(&m, w, h, p % w, p / w));
+                        there.is_some_and(|q| !clipped[*j][q] && tukey(greys[*j].data[q], alpha) >= 1.0)
+                    });
                     low_taper(1.0 - z, alpha) * if covered { low_taper(z, alpha) } else { 1.0 }
                 })
                 .collect();

@@ -4,6 +4,8 @@ use crate::exposure::Bracket;
 use crate::image::{Plane, Rgb};
 use crate::kernels::NOISE_STEPS;
 use crate::mask;
+use crate::pose::{nearest_pixel, project};
+use glam::{DMat3, DVec2};
 
 /// Inverse-variance mean of f⁻¹(Z)/Δt over the frames `ids`, positive everywhere. Variances are those of the locally smoothed exposure: a
 /// pixel's own value would give more weight to what noise made darker.
@@ -34,15 +36,45 @@ pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves:
     }))
 }
 
+/// `image` and its mask as seen from another grid of the same size, `motion` being the way from there to the image (centred pixels):
+/// bilinear; the mask is 0 beyond the image. Good for a start, not for the solution: it smooths.
+pub fn resampled(image: &Rgb, mask: &Plane, motion: &DMat3) -> (Rgb, Plane) {
+    let (w, h) = image.size();
+    let centre = DVec2::new(0.5 * (w as f64 - 1.0), 0.5 * (h as f64 - 1.0));
+    let mut out = image.clone();
+    let mut seen = mask.clone();
+    for y in 0..h {
+        for x in 0..w {
+            let q = project(motion, DVec2::new(x as f64, y as f64) - centre) + centre;
+            let (fx, fy) = (q.x.floor(), q.y.floor());
+            let (u, v) = ((q.x - fx) as f32, (q.y - fy) as f32);
+            let (i, j) = (fx as isize, fy as isize);
+            for (o, p) in out.0.iter_mut().zip(&image.0) {
+                let at = |a: isize, b: isize| p.clamped(i + a, j + b);
+                o.data[y * w + x] = (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1));
+            }
+            let inside = q.x >= 0.0 && q.y >= 0.0 && q.x <= w as f64 - 1.0 && q.y <= h as f64 - 1.0;
+            let at = |a: isize, b: isize| mask.clamped(i + a, j + b);
+            seen.data[y * w + x] = if inside { at(0, 0).min(at(1, 0)).min(at(0, 1)).min(at(1, 1)) } else { 0.0 };
+        }
+    }
+    (out, seen)
+}
+
 /// Raises pixels that the shortest of the frames `ids` has clipped to the irradiance that clips it: the best lower bound there is.
-pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: &[Rgb], ids: &[usize]) {
+///
+/// `motions`: each frame's place, from the reference, centred pixels.
+pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: &[Rgb], ids: &[usize], motions: &[DMat3]) {
     let frames = bracket.frames();
     let Some(shortest) = bracket.shortest(ids) else { return };
+    let (w, h) = bracket.size();
+    let motion = motions[shortest];
     for c in 0..3 {
         let z = &frames[shortest].intensity.0[c];
         for (p, v) in irradiance.0[c].data.iter_mut().enumerate() {
-            if z.data[p] >= mask::CLIPPED {
-                *v = v.max(exposures[shortest].0[c].data[p] / frames[shortest].exposure_time as f32);
+            let there = if motion == DMat3::IDENTITY { Some(p) } else { nearest_pixel(&motion, w, h, p % w, p / w) };
+            if let Some(q) = there.filter(|&q| z.data[q] >= mask::CLIPPED) {
+                *v = v.max(exposures[shortest].0[c].data[q] / frames[shortest].exposure_time as f32);
             }
         }
     }

@@ -9,11 +9,13 @@ use crate::kernels::Kernels;
 use crate::mask;
 use crate::merge;
 use crate::noise::{self, NoiseModel};
+use crate::pose::project;
 use crate::psf;
+use crate::register::{self, Registrar, Registration};
 use crate::response::Response;
 use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
-use glam::DMat3;
+use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 use std::time::Instant;
 
@@ -26,6 +28,8 @@ pub struct Settings {
     pub sharp: Option<Vec<usize>>,
     /// Frames (0-based) to leave out.
     pub exclude: Vec<usize>,
+    /// Whether frames are registered; otherwise they are taken as they lie.
+    pub align: bool,
     /// α of the Tukey window, 0..=1.
     pub alpha: f64,
     /// How the camera may move during a shaken frame.
@@ -34,6 +38,8 @@ pub struct Settings {
     pub focal_px: Option<f64>,
     /// Pixels (x, y) at which to look at the blur; empty: chosen.
     pub patches: Vec<(usize, usize)>,
+    /// Noise level of the frames; `None`: estimated from them.
+    pub noise: Option<NoiseModel>,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
@@ -44,10 +50,12 @@ impl Default for Settings {
             reference: None,
             sharp: None,
             exclude: Vec::new(),
+            align: true,
             alpha: 0.3,
             model: Model::Auto,
             focal_px: None,
             patches: Vec::new(),
+            noise: None,
             deblur: deblur::Settings::default(),
         }
     }
@@ -73,6 +81,8 @@ pub struct Outcome {
     pub irradiance: Rgb,
     /// Index (0-based, in command-line order) of the reference frame.
     pub reference: usize,
+    /// Names of frames that the program, not the user, left out, and why.
+    pub left_out: Vec<(String, String)>,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
     pub report: Value,
 }
@@ -88,6 +98,8 @@ const HOPELESS: f64 = 8.0;
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 3;
+/// Outer iterations of the rounds before the last.
+const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
@@ -104,6 +116,10 @@ struct Run<'a> {
     masks: Vec<Plane>,
     noise: NoiseModel,
     curves: Vec<[Vec<f32>; 3]>,
+    /// Where each frame lies, from the reference (centred pixels), and how that was found.
+    motions: Vec<DMat3>,
+    registrations: Vec<Registration>,
+    left_out: Vec<(String, String)>,
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
 }
@@ -126,12 +142,27 @@ pub fn merge(
     let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let start = Instant::now();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
-    let noise = noise::estimate(frames, &exposures, response);
+    let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
     let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
-    let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref());
-    let mut run = Run { gpu, kernels, bracket, settings, exposures, masks: Vec::new(), noise, curves, events, timings: Vec::new() };
+    let motions = vec![DMat3::IDENTITY; frames.len()];
+    let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
+    let mut run = Run {
+        gpu,
+        kernels,
+        bracket,
+        settings,
+        exposures,
+        masks: Vec::new(),
+        noise,
+        curves,
+        motions,
+        registrations: vec![Registration::skipped(); frames.len()],
+        left_out: Vec::new(),
+        events,
+        timings: Vec::new(),
+    };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
-    run.reconstruct(verdicts, &excluded, given)
+    run.reconstruct(verdicts, excluded, given)
 }
 
 fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
@@ -174,7 +205,83 @@ impl Run<'_> {
         Ok(out)
     }
 
-    fn reconstruct(mut self, verdicts: Vec<Verdict>, excluded: &[bool], given: Option<&TsfFile>) -> Result<Outcome> {
+    /// A frame is left out because of what was found about it.
+    fn leave_out(&mut self, i: usize, why: &str) -> Result<()> {
+        let name = self.bracket.frames()[i].name.clone();
+        self.warn(format!("{name}: {why}; it is left out"))?;
+        self.left_out.push((name, why.into()));
+        Ok(())
+    }
+
+    /// Registers the frames against each other, leaves out those that cannot be, and looks again which are sharp, pixel by pixel of the
+    /// scene. `known`: frames whose place the user gave.
+    fn align(&mut self, mut verdicts: Vec<Verdict>, excluded: &mut [bool], known: &[bool]) -> Result<Vec<Verdict>> {
+        let frames = self.bracket.frames();
+        let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
+        let sharp: Vec<bool> = verdicts.iter().map(|v| v.sharp).collect();
+        let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        let first = self.settings.reference.or_else(|| self.bracket.longest(&still)).or_else(|| self.bracket.shortest(&used)).unwrap_or(0);
+        let mut found = self.register_on(first, &used, &sharp, known)?;
+        // If most do not fit the first reference, it may be the one that is not of the scene.
+        let misfits = |r: &[Registration]| used.iter().filter(|&&i| !r[i].registered).count();
+        if self.settings.reference.is_none() && used.len() > 2 && 2 * misfits(&found) >= used.len() {
+            let rest: Vec<usize> = used.iter().copied().filter(|&i| i != first).collect();
+            let still: Vec<usize> = rest.iter().copied().filter(|&i| sharp[i]).collect();
+            if let Some(second) = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&rest)) {
+                let other = self.register_on(second, &used, &sharp, known)?;
+                if misfits(&other) < misfits(&found) {
+                    found = other;
+                }
+            }
+        }
+        for &i in &used {
+            if !found[i].registered {
+                self.leave_out(i, &found[i].reason)?;
+                excluded[i] = true;
+            }
+        }
+        self.motions = found.iter().map(Registration::motion).collect();
+        self.registrations = found;
+        let moved = self.motions.iter().any(|m| *m != DMat3::IDENTITY);
+        if moved || !self.left_out.is_empty() {
+            let given = self.settings.sharp.as_deref();
+            verdicts = triage::triage(frames, &self.exposures, &self.noise, excluded, given, &self.motions);
+        }
+        Ok(verdicts)
+    }
+
+    fn register_on(&mut self, reference: usize, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
+        let frames = self.bracket.frames();
+        let mut found = vec![Registration::skipped(); frames.len()];
+        let (exposures, noise) = (std::mem::take(&mut self.exposures), self.noise);
+        let mut registrar = Registrar::new(frames, &exposures, &noise, reference);
+        found[reference] = registrar.of_reference();
+        let mut going = Ok(());
+        for i in registrar.order(used, sharp).into_iter().filter(|&i| !known[i]) {
+            going = self.progress(&format!("registering {}", frames[i].name), 0.02);
+            if going.is_err() {
+                break;
+            }
+            found[i] = registrar.register(i, sharp[i]);
+        }
+        self.exposures = exposures;
+        going.map(|()| found)
+    }
+
+    /// Motions from the frame `reference` instead.
+    fn rebase(&mut self, reference: usize) {
+        if self.motions[reference] == DMat3::IDENTITY {
+            return;
+        }
+        let (w, h) = self.bracket.size();
+        let back = self.motions[reference].inverse();
+        for (motion, found) in self.motions.iter_mut().zip(&mut self.registrations) {
+            *motion = register::rebased(motion, &back, w, h);
+            found.homography = register::rows(motion);
+        }
+    }
+
+    fn reconstruct(mut self, verdicts: Vec<Verdict>, mut excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<Outcome> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
@@ -187,47 +294,63 @@ impl Run<'_> {
                 }
             }
         }
+        let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
+        let verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
+            self.timed("registration", |run| run.align(verdicts, &mut excluded, &known))?
+        } else {
+            verdicts
+        };
+        let used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
+        for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
+            if let Some(tsf) = tsf {
+                *motion = tsf.centre();
+            }
+        }
         let mut sharp: Vec<bool> =
-            (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, Tsf::is_identity)).collect();
+            (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, |t| t.single().is_some())).collect();
         let all_known = used.iter().all(|&i| tsfs[i].is_some());
         let blind = !sharp.contains(&true) && !all_known;
         if blind {
             self.warn("no frame is sharp: the frames are merged without deblurring".into())?;
             for &i in &used {
                 sharp[i] = true;
-                tsfs[i] = Some(Tsf::identity());
             }
         }
         let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
         let reference = self.settings.reference.or(found).unwrap_or(0);
-        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32);
+        if known.iter().all(|k| !k) {
+            self.rebase(reference);
+        }
+        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
         let mut details: Vec<Value> = vec![Value::Null; frames.len()];
 
         // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
         let start_frames = if still.is_empty() { shaken.clone() } else { still.clone() };
         self.progress("merging the sharp frames", 0.03)?;
-        let initial = merge::irradiance(self.bracket, &self.exposures, &self.masks, &self.curves, &start_frames);
+        let initial = self.start(&start_frames);
         for &i in &still {
-            tsfs[i] = Some(Tsf::identity());
+            tsfs[i] = Some(Tsf::still(self.motions[i]));
         }
         // Without blur an iteration costs next to nothing: this solution may converge.
         let alone = deblur::Settings { outer: SHARP_OUTER, ..self.settings.deblur.clone() };
-        let base = self.timed("sharp frames", |run| {
-            run.solve(&start_frames, &vec![Some(Tsf::identity()); frames.len()], &initial, 0, &alone, 0.05, 0.10)
-        })?;
+        let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
+        let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
+        let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
+        let initial = initial.map_planes(|p| p.padded(pad));
+        let base = self.timed("sharp frames", |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.05, 0.10))?;
         let mut latent = base.cropped();
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
-            let (tsf, detail) = self.timed("blur", |run| Ok(run.estimate(i, &latent, DMat3::IDENTITY)))?;
+            let (tsf, detail) = self.timed("blur", |run| Ok(run.estimate(i, &latent)))?;
             if tsf.is_none() {
-                self.warn(format!(
-                    "{}: too little texture that both it and the sharp frames see clearly to find its blur; it is left out. A sharp frame \
-                     with a longer exposure time, or a scene with more detail where this frame is not clipped, would help",
-                    frames[i].name
-                ))?;
+                self.leave_out(
+                    i,
+                    "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
+                     time, or more detail where this frame is not clipped, would help)",
+                )?;
             }
             tsfs[i] = tsf;
             details[i] = detail;
@@ -243,17 +366,18 @@ impl Run<'_> {
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                    tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, DMat3::IDENTITY, tsfs[i].as_ref())))?;
+                    tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
-            let pad = deblur::pad_for(&known, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
-            let from = latent.map_planes(|p| p.padded(pad));
+            let pad = deblur::pad_for(&known, w, h, limit);
+            let from = solution.as_ref().unwrap_or(&base).with_pad(pad);
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
-            let inner = if round + 1 < rounds { self.settings.deblur.inner * 3 / 8 } else { self.settings.deblur.inner };
-            // Without a sharp frame there is no good start, and the first steps are spent on finding one.
-            let outer = self.settings.deblur.outer * if still.is_empty() { 3 } else { 1 };
-            let settings = deblur::Settings { inner, outer, ..self.settings.deblur.clone() };
+            let settings = if round + 1 < rounds {
+                deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() }
+            } else {
+                self.settings.deblur.clone()
+            };
             let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
             // TSFs that the user gave are believed.
@@ -261,11 +385,7 @@ impl Run<'_> {
                 .iter()
                 .filter(|i| shaken.contains(i))
                 .map(|&i| (i, chi(i)))
-                .filter(|&(i, c)| {
-                    c > HOPELESS
-                        && c > UNEXPLAINED
-                            * merge::misfit(&start, &self.exposures[i], &self.masks[i], &self.curves[i], frames[i].exposure_time)
-                })
+                .filter(|&(i, c)| c > HOPELESS && c > UNEXPLAINED * self.unblurred(i, &start))
                 .collect();
             if hopeless.is_empty() {
                 latent = solved.cropped();
@@ -275,10 +395,7 @@ impl Run<'_> {
             }
             // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
             for (i, chi) in hopeless {
-                self.warn(format!(
-                    "{}: no camera shake explains it (its residual is {chi:.1} times its noise); it is left out",
-                    frames[i].name
-                ))?;
+                self.leave_out(i, &format!("no camera shake explains it (its residual is {chi:.1} times its noise)"))?;
                 shaken.retain(|&k| k != i);
                 all.retain(|&k| k != i);
             }
@@ -320,7 +437,49 @@ impl Run<'_> {
         })
     }
 
-    /// Luminance of frame `i` and its inverse variance, model error included.
+    /// Merge of the frames `ids` on the reference's grid, to start from.
+    fn start(&self, ids: &[usize]) -> Rgb {
+        if ids.iter().all(|&i| self.motions[i] == DMat3::IDENTITY) {
+            return merge::irradiance(self.bracket, &self.exposures, &self.masks, &self.curves, ids);
+        }
+        let seen = (0..self.exposures.len()).map(|i| {
+            if ids.contains(&i) && self.motions[i] != DMat3::IDENTITY {
+                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i])
+            } else {
+                (self.exposures[i].clone(), self.masks[i].clone())
+            }
+        });
+        let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = seen.unzip();
+        merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids)
+    }
+
+    /// Mean squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred.
+    fn unblurred(&self, i: usize, latent: &Rgb) -> f64 {
+        let (exposure, mask) = (&self.exposures[i], &self.masks[i]);
+        let (seen, inside) = if self.motions[i] == DMat3::IDENTITY {
+            (latent.clone(), mask.clone())
+        } else {
+            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse())
+        };
+        let mask = mask.zip(&inside, |m, k| m * k);
+        merge::misfit(&seen, exposure, &mask, &self.curves[i], self.bracket.frames()[i].exposure_time)
+    }
+
+    /// Motion about which the poses of the blurred frame `i` are looked for: the search covers what is left.
+    fn base(&self, i: usize) -> DMat3 {
+        let (w, h) = self.bracket.size();
+        let motion = self.motions[i];
+        if register::distance(&motion, &DMat3::IDENTITY, w, h).1 < SEARCHED {
+            return DMat3::IDENTITY;
+        }
+        // Whole pixels need no interpolation.
+        let centre = project(&motion, DVec2::ZERO);
+        let shift = DMat3::from_translation(centre.round());
+        let whole = DMat3::from_translation(centre.round() - centre) * motion;
+        if register::distance(&whole, &shift, w, h).1 < 0.5 * SEARCHED { shift } else { whole }
+    }
+
+    /// Luminance of frame `i` and its inverse variance, model error included; `latent` lies on its grid.
     fn luminance(&self, i: usize, latent: &Plane) -> (Plane, Plane) {
         let frame = &self.bracket.frames()[i];
         let dt = frame.exposure_time as f32;
@@ -341,15 +500,17 @@ impl Run<'_> {
         (exposure.map(|v| v / dt), weight)
     }
 
-    /// TSF of frame `i`, which lies at `base` on the latent grid before it moves, against the sharp irradiance; and, for people to look
-    /// at, patches and their PSFs (11).
-    fn estimate(&self, i: usize, latent: &Rgb, base: DMat3) -> (Option<Tsf>, Value) {
+    /// TSF of frame `i` against the sharp irradiance, about where the frame lies; and, for people to look at, patches and their PSFs (11).
+    fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
+        let base = self.base(i);
+        let (seen, inside) = self.seen(latent, &base);
         let latent = latent.mean();
-        let (blurred, weight) = self.luminance(i, &latent);
+        let (blurred, weight) = self.luminance(i, &seen);
+        let weight = weight.zip(&inside, |w, k| w * k);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
         let search = Search { model: self.settings.model, focal_px: self.settings.focal_px };
         let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
-        let psfs = self.psfs(&frame, &found.tsf);
+        let psfs = self.psfs(&seen, &blurred, &weight, &found.tsf);
         let detail = json!({
             "model": found.model,
             "focal_px": found.tsf.focal_px,
@@ -367,29 +528,40 @@ impl Run<'_> {
     }
 
     /// PSFs of chosen or given patches, looked for around where `tsf` passes.
-    fn psfs(&self, frame: &WholeFrame, tsf: &Tsf) -> Vec<(psf::Patch, psf::Measured)> {
-        let aligned = frame.aligned();
-        let (w, h) = aligned.size();
+    fn psfs(&self, seen: &Plane, blurred: &Plane, weight: &Plane, tsf: &Tsf) -> Vec<(psf::Patch, psf::Measured)> {
+        let (w, h) = seen.size();
         let reach = tsf::extent(tsf, w, h).ceil() as usize;
         let size = PATCH_SIZE.max(3 * reach / 2).min(w / 2).min(h / 2).max(16);
         let patches = if self.settings.patches.is_empty() {
-            psf::choose(&aligned, frame.weight, size, PATCHES)
+            psf::choose(seen, weight, size, PATCHES)
         } else {
-            self.settings.patches.iter().map(|&(x, y)| psf::around(&aligned, frame.weight, x, y, size)).collect()
+            self.settings.patches.iter().map(|&(x, y)| psf::around(seen, weight, x, y, size)).collect()
         };
         let measure = |p: &psf::Patch| {
             let path = tsf::path_at(tsf, p.centre(), (w, h));
             let radius = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
             let near = |x: isize, y: isize| path.iter().any(|u| (u.0 - x).abs() <= PSF_MARGIN && (u.1 - y).abs() <= PSF_MARGIN);
-            let m = psf::estimate_within(&aligned, 0, frame.blurred, frame.weight, p, radius as usize, &near)?;
-            Some((*p, m))
+            Some((*p, psf::estimate_within(seen, 0, blurred, weight, p, radius as usize, &near)?))
         };
         patches.iter().filter_map(measure).collect()
     }
 
-    fn refine(&self, i: usize, latent: &Rgb, base: DMat3, tsf: Option<&Tsf>) -> Option<Tsf> {
+    /// Luminance of the irradiance `latent` on the grid of a frame at `motion`, and 1 where it reaches.
+    fn seen(&self, latent: &Rgb, motion: &DMat3) -> (Plane, Plane) {
+        let everywhere = self.masks[0].map(|_| 1.0);
+        if *motion == DMat3::IDENTITY {
+            return (latent.mean(), everywhere);
+        }
+        let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse());
+        (seen.mean(), inside)
+    }
+
+    fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
+        let base = tsf.map_or(DMat3::IDENTITY, |t| t.base);
+        let (seen, inside) = self.seen(latent, &base);
         let latent = latent.mean();
-        let (blurred, weight) = self.luminance(i, &latent);
+        let (blurred, weight) = self.luminance(i, &seen);
+        let weight = weight.zip(&inside, |w, k| w * k);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
         tsf.map(|t| frame.refine(t))
     }
@@ -407,7 +579,7 @@ impl Run<'_> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let mut irradiance = solution.cropped();
-        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, all);
+        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, all, &self.motions);
         let scale = frames[reference].exposure_time as f32;
         let irradiance = irradiance.map_planes(|p| p.map(|v| v * scale));
         let entries: Vec<Value> = (0..frames.len())
@@ -419,11 +591,10 @@ impl Run<'_> {
                     "used": position.is_some(),
                     "sharp": sharp[i],
                     "triage": verdicts[i],
+                    "registration": self.registrations[i],
                     "chi_squared": position.map(|p| solution.report.chi_squared[p]),
                     "blur": details[i],
-                    "tsf": tsfs[i].as_ref().map(|t| TsfEntry {
-                        frame: frames[i].name.clone(), width: w, height: h, focal_px: t.focal_px, poses: t.poses.clone(),
-                    }),
+                    "tsf": tsfs[i].as_ref().map(|t| TsfEntry::new(&frames[i].name, w, h, t)),
                 })
             })
             .collect();
@@ -437,12 +608,15 @@ impl Run<'_> {
             "scale": { "rule": "value = irradiance * exposure time of the reference frame", "factor_s": scale },
             "noise": self.noise,
             "frames": entries,
+            "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,
             "timings_s": std::mem::take(&mut self.timings),
         });
-        Ok(Outcome { irradiance, reference, report })
+        Ok(Outcome { irradiance, reference, left_out: self.left_out, report })
     }
 }
 
+/// Displacement in pixels of a blurred frame that the search for its poses covers by itself.
+const SEARCHED: f64 = 3.0;
 /// Standard deviation of the operator's own error, as a part of the mean absolute gradient around a pixel.
 const MODEL_ERROR: f32 = 0.03;

@@ -63,6 +63,14 @@ pub fn project(h: &DMat3, p: DVec2) -> DVec2 {
     DVec2::new(q.x / q.z, q.y / q.z)
 }
 
+/// Index, row by row, of the pixel of a `width` x `height` frame nearest to where `h` (centred pixels) takes the pixel (x, y); `None` outside.
+pub fn nearest_pixel(h: &DMat3, width: usize, height: usize, x: usize, y: usize) -> Option<usize> {
+    let centre = DVec2::new(0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let q = project(h, DVec2::new(x as f64, y as f64) - centre) + centre;
+    let (i, j) = (q.x.round(), q.y.round());
+    (i >= 0.0 && j >= 0.0 && i < width as f64 && j < height as f64).then(|| j as usize * width + i as usize)
+}
+
 /// The sampled transformation space H of section II-B: integer translations and equally spaced roll angles.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseGrid {

@@ -4,6 +4,8 @@ use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::noise::NoiseModel;
+use crate::pose::nearest_pixel;
+use glam::DMat3;
 use serde::Serialize;
 
 /// What the triage found about one frame.
@@ -50,6 +52,23 @@ fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
     Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid }
 }
 
+impl Luminance {
+    /// As pixels of another frame see it, `motion` being the way from there to here: the nearest pixel, since interpolation would take
+    /// fine structure away.
+    fn seen(&self, motion: &DMat3) -> Self {
+        let (w, h) = self.value.size();
+        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: vec![false; w * h] };
+        for p in 0..w * h {
+            if let Some(q) = nearest_pixel(motion, w, h, p % w, p / w) {
+                out.value.data[p] = self.value.data[q];
+                out.variance.data[p] = self.variance.data[q];
+                out.valid[p] = self.valid[q];
+            }
+        }
+        out
+    }
+}
+
 /// Noise-free energy and its uncertainty (two standard deviations, and the noise level's own error), of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid in `a` and `b`;
 /// weighted by the larger variance of the two, so that both sums of a pair speak of the same pixels in the same way.
 fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: usize) -> (f64, f64) {
@@ -74,19 +93,30 @@ fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: us
     (sum, 2.0 * scatter.sqrt() + NOISE_ERROR * noise)
 }
 
-/// Sorts the frames. `given` (from the user) overrides; the numbers are reported all the same.
-pub fn triage(frames: &[Frame], exposures: &[Rgb], noise: &NoiseModel, excluded: &[bool], given: Option<&[usize]>) -> Vec<Verdict> {
+/// Sorts the frames. `given` (from the user) overrides; the numbers are reported all the same. `motions`: each frame's place, from the
+/// reference, centred pixels.
+pub fn triage(
+    frames: &[Frame],
+    exposures: &[Rgb],
+    noise: &NoiseModel,
+    excluded: &[bool],
+    given: Option<&[usize]>,
+    motions: &[DMat3],
+) -> Vec<Verdict> {
     let all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
     let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
     let mut verdicts: Vec<Verdict> = (0..frames.len())
         .map(|i| {
             let mut detail = 1.0f64;
             for &j in used.iter().filter(|&&j| j != i) {
+                // Each of the two on its own pixels, of which those count that the other sees as well.
+                let apart = motions[i] != motions[j];
+                let from_i = apart.then(|| all[j].seen(&(motions[j] * motions[i].inverse())));
+                let from_j = apart.then(|| all[i].seen(&(motions[i] * motions[j].inverse())));
+                let (a, b) = (from_i.as_ref().unwrap_or(&all[j]), from_j.as_ref().unwrap_or(&all[i]));
                 for direction in DIRECTIONS {
-                    let ((own, own_error), (other, error)) =
-                        (energy(&all[i], &all[j], direction, 1), energy(&all[j], &all[i], direction, 1));
-                    let (coarse, coarse_other) =
-                        (energy(&all[i], &all[j], direction, COARSE).0, energy(&all[j], &all[i], direction, COARSE).0);
+                    let ((own, own_error), (other, error)) = (energy(&all[i], a, direction, 1), energy(&all[j], b, direction, 1));
+                    let (coarse, coarse_other) = (energy(&all[i], a, direction, COARSE).0, energy(&all[j], b, direction, COARSE).0);
                     // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
                     let contrast = if coarse > 0.0 && coarse_other > 0.0 { (coarse / coarse_other).min(1.0) } else { 1.0 };
                     // Only where the other frame's fine structure stands clear of its noise, and of this frame's.

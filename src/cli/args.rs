@@ -1,6 +1,6 @@
 //! The command line.
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
 /// Turns a hand-held exposure bracket with camera shake into one sharp HDR irradiance image.
@@ -14,7 +14,7 @@ pub(super) struct CommandLine {
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
     /// Reconstruct the sharp irradiance of a bracket
-    Merge(MergeArgs),
+    Merge(Box<MergeArgs>),
     /// Measure the camera's response from an unblurred bracket (tripod), for merge --response
     Calibrate(CalibrateArgs),
     /// Make a shaken bracket, reconstruct it, and show what was gained
@@ -34,7 +34,8 @@ pub(super) struct MergeArgs {
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
-    /// Camera response: srgb, linear, gamma:2.2, or a file from 'unshaken calibrate' [default: srgb, with a warning]
+    /// Camera response: srgb, linear, gamma:2.2, a file from 'unshaken calibrate', or auto (from these frames) [default: auto for
+    /// JPEG, srgb with a warning for PNG and TIFF]
     #[arg(long, value_name = "NAME|FILE.json")]
     pub response: Option<String>,
     /// Frame on whose pixel grid the result lies [default: the longest sharp frame]
@@ -46,6 +47,12 @@ pub(super) struct MergeArgs {
     /// Leave these frames out
     #[arg(long, value_name = "N,N,...", allow_hyphen_values = true)]
     pub exclude: Option<String>,
+    /// Take the frames as they lie, without registering them against each other
+    #[arg(long)]
+    pub no_align: bool,
+    /// Exit with code 3 when a frame had to be left out (what the others give is written all the same)
+    #[arg(long)]
+    pub strict: bool,
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
     #[arg(long, value_name = "A", allow_hyphen_values = true)]
     pub alpha: Option<String>,
@@ -59,6 +66,9 @@ pub(super) struct MergeArgs {
     /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
     pub patch: Vec<String>,
+    /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
+    #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
+    pub noise: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,
@@ -84,9 +94,19 @@ pub(super) struct CalibrateArgs {
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
+    /// How: debevec (a table, all exposure times believed) or mitsunaga (a polynomial, exposure times refined)
+    #[arg(long, value_name = "NAME", value_enum, default_value_t = Method::Debevec)]
+    pub method: Method,
     /// Replace an output that exists
     #[arg(long)]
     pub overwrite: bool,
+}
+
+/// How a response is calibrated.
+#[derive(Clone, Copy, Debug, PartialEq, ValueEnum)]
+pub(super) enum Method {
+    Debevec,
+    Mitsunaga,
 }
 
 #[derive(Debug, Args)]

@@ -1,6 +1,6 @@
 //! `unshaken calibrate`.
 
-use super::args::CalibrateArgs;
+use super::args::{CalibrateArgs, Method};
 use super::progress::Progress;
 use super::{Usage, frames};
 use crate::io::output::{self, Output};
@@ -17,12 +17,32 @@ pub(super) fn run(args: &CalibrateArgs) -> anyhow::Result<()> {
     progress.at("reading frames", 0.0);
     let bracket = frames::read(&args.frames, times)?;
     progress.at("calibrating", 0.4);
-    let response = response::calibrate(&bracket)?;
+    let given: Vec<f64> = bracket.frames().iter().map(|f| f.exposure_time).collect();
+    let (response, method, exposure_times) = match args.method {
+        Method::Debevec => {
+            let method = "Debevec and Malik 1997, per channel, all pixels, ends extrapolated".to_owned();
+            (response::calibrate(&bracket)?, method, given.clone())
+        }
+        Method::Mitsunaga => {
+            let found = response::mitsunaga(&bracket)?;
+            let method = format!("Mitsunaga and Nayar 1999, polynomials of degree {}, exposure times refined", found.degree);
+            (found.response, method, found.exposure_times)
+        }
+    };
+    // Without a response to compare with, only times that contradict each other are seen; frames that say nothing say so.
+    let check = response::automatic(&bracket).ok().map(|a| a.exposures);
+    if let Some(text) = check.and_then(|c| c.warning(&bracket)) {
+        progress.warn(&text);
+    }
+    if args.method == Method::Mitsunaga {
+        let differences: Vec<String> = exposure_times.iter().zip(&given).map(|(t, g)| format!("{:+.2}", (t / g).log2())).collect();
+        progress.at(&format!("exposure times refined by {} EV", differences.join(", ")), 0.9);
+    }
     let provenance = Provenance {
         program: concat!("unshaken ", env!("CARGO_PKG_VERSION")).into(),
-        method: "Debevec and Malik 1997, per channel, all pixels, ends extrapolated".into(),
+        method,
         frames: bracket.frames().iter().map(|f| f.name.clone()).collect(),
-        exposure_times: bracket.frames().iter().map(|f| f.exposure_time).collect(),
+        exposure_times,
     };
     target.stage_json(&ResponseFile::new(&response, provenance))?.commit()?;
     drop(progress);

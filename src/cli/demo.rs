@@ -184,13 +184,7 @@ pub fn as_taken(frame: &Frame, response: &Response, truth: &Rgb) -> Rgb {
 /// The bracket's true TSFs as a TSF file.
 fn true_tsfs(synthetic: &SyntheticBracket) -> TsfFile {
     let (width, height) = synthetic.bracket.size();
-    let entry = |(frame, tsf): (&Frame, &crate::tsf::Tsf)| TsfEntry {
-        frame: frame.name.clone(),
-        width,
-        height,
-        focal_px: tsf.focal_px,
-        poses: tsf.poses.clone(),
-    };
+    let entry = |(frame, tsf): (&Frame, &crate::tsf::Tsf)| TsfEntry::new(&frame.name, width, height, tsf);
     TsfFile::new(synthetic.bracket.frames().iter().zip(&synthetic.tsfs).map(entry).collect())
 }
 

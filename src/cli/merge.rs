@@ -1,46 +1,43 @@
 //! `unshaken merge`.
 
 use super::args::MergeArgs;
-use super::{Usage, frames, with_progress};
+use super::{Done, Usage, frames, with_progress};
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::Radiometry;
 use crate::io::output::{self, Output};
+use crate::noise::NoiseModel;
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
 use crate::tsf::{Model, TsfFile};
 use std::path::{Path, PathBuf};
 
-pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
+pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
     frames::check(&args.frames)?;
-    let named = args.response.as_deref().map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
-    let response_file = args.response.as_deref().filter(|_| named.is_none()).map(Path::new);
+    let given = args.response.as_deref().filter(|r| *r != "auto");
+    let named = given.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
+    let response_file = given.filter(|_| named.is_none()).map(Path::new);
     let (exr, preview, report) = outputs(args, response_file)?;
 
     let response = match (named, response_file) {
-        (Some(response), _) => response,
-        (None, Some(path)) => read_response(path)?,
-        (None, None) => Response::Srgb,
+        (None, Some(path)) => Some(read_response(path)?),
+        (named, _) => named,
     };
     let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
     if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
         check_tsf_names(file, path, &args.frames)?;
     }
 
-    let text = with_progress(|events| {
+    let (text, left_out) = with_progress(|events| {
         events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
         let bracket = frames::read(&args.frames, times)?;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
-        if args.response.is_none() {
-            let text =
-                "no --response given: the frames are taken as sRGB, which a camera's own curve is not; 'unshaken calibrate' measures it";
-            events(Event::Warning(text.into()));
-        }
+        let (response, origin) = super::response::choose(args, response, &bracket, events)?;
         if args.frames.len() == settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
@@ -50,8 +47,10 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
             let (w, h) = bracket.size();
             settings.focal_px = frames::focal_px(&args.frames[0], w, h)?;
         }
-        let outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
+        let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
+
+        outcome.report["response"] = origin;
 
         // All are complete before the first is renamed.
         let reference = &bracket.frames()[outcome.reference];
@@ -66,10 +65,10 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<()> {
         for file in staged {
             file.commit()?;
         }
-        Ok(summary(args, &bracket, outcome.reference))
+        Ok((summary(args, &bracket, outcome.reference), outcome.left_out))
     })?;
     println!("{text}");
-    Ok(())
+    Ok(if args.strict && !left_out.is_empty() { Done::Degraded } else { Done::AsAsked })
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
@@ -86,7 +85,7 @@ fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
 
 fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     let n = args.frames.len();
-    let mut settings = Settings::default();
+    let mut settings = Settings { align: !args.no_align, ..Settings::default() };
     if let Some(word) = &args.reference {
         settings.reference = Some(frame_number("--reference", word, n)?);
     }
@@ -116,6 +115,7 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         let pixel = word.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
         settings.patches.push(pixel.ok_or_else(|| Usage(format!("--patch: {word:?} is not a pixel such as 120,80")))?);
     }
+    settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
         return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));
@@ -150,6 +150,20 @@ fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, 
     Ok(indices)
 }
 
+/// The level that `--noise` gives.
+fn noise_level(text: &str) -> Result<NoiseModel, Usage> {
+    let refuse =
+        || Usage(format!("--noise: {text:?} is not a full well of at least 1 and a read noise of at least 0 electrons, such as 12000,6"));
+    let (well, read) = text.split_once(',').ok_or_else(refuse)?;
+    match (well.trim().parse::<f64>(), read.trim().parse::<f64>()) {
+        // A read noise of nothing would divide by nothing where the frame is black; a tenth of an electron is as good.
+        (Ok(w), Ok(r)) if w.is_finite() && w >= 1.0 && r.is_finite() && (0.0..=w).contains(&r) => {
+            Ok(NoiseModel::from_electrons(w, r.max(0.1)))
+        }
+        _ => Err(refuse()),
+    }
+}
+
 /// The three outputs, of which each can be written.
 fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Output, Option<Output>, Option<Output>)> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
@@ -165,7 +179,7 @@ fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Ou
 
 fn read_response(path: &Path) -> Result<Response, Error> {
     if !path.exists() {
-        let reason = "is neither srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
+        let reason = "is neither auto, srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
         return Err(Error::Format { path: path.into(), reason });
     }
     let text = crate::io::read_text(path)?;

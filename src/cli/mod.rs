@@ -1,6 +1,6 @@
 //! The command line: arguments, one file per command, progress. The only place that prints.
 //!
-//! Exit code 0: done; 1: failed; 2: the command line itself is wrong. An error is one line on standard error.
+//! Exit code 0: done; 1: failed; 2: the command line itself is wrong; 3: done, but not as asked (`--strict`). An error is one line on standard error.
 
 mod adapters;
 mod args;
@@ -9,6 +9,7 @@ pub mod demo;
 mod frames;
 mod merge;
 mod progress;
+mod response;
 
 use crate::pipeline::Event;
 use clap::Parser;
@@ -18,6 +19,15 @@ use std::process::ExitCode;
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 struct Usage(String);
+
+/// How a command that did not fail ended.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Done {
+    /// All is as asked.
+    AsAsked,
+    /// Something was written, but frames had to be left out, and the user wants to know: exit code 3.
+    Degraded,
+}
 
 /// Runs the program on the process's arguments.
 pub fn run() -> ExitCode {
@@ -32,12 +42,16 @@ pub fn run() -> ExitCode {
     };
     let done = match line.command {
         args::Command::Merge(a) => merge::run(&a),
-        args::Command::Calibrate(a) => calibrate::run(&a),
-        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)).map(|text| println!("{text}")),
-        args::Command::Adapters => adapters::run(),
+        args::Command::Calibrate(a) => calibrate::run(&a).map(|()| Done::AsAsked),
+        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)).map(|text| {
+            println!("{text}");
+            Done::AsAsked
+        }),
+        args::Command::Adapters => adapters::run().map(|()| Done::AsAsked),
     };
     match done {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(Done::AsAsked) => ExitCode::SUCCESS,
+        Ok(Done::Degraded) => ExitCode::from(3),
         Err(e) => report(&e),
     }
 }

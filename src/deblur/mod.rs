@@ -7,16 +7,21 @@
 //!
 //! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
 //!
-//! then tries u + clamp(s·δu, ±1) for s = 1, 1/2, 1/4, ... until the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with
-//! these weights) does not rise. λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
-//! The iteration stops when an outer step lowers the objective by less than `tolerance` of it, or at `outer` steps.
+//! then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu) elsewhere (at most fourfold, at least 1/e) for s = 1, 1/2, 1/4, ... until
+//! the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with these weights) does not rise. The data term is quadratic in E: with
+//! the first form a bracket without a sharp frame needs half the outer iterations that exp(s·δu) in both directions needs.
+//! λ is a pure number: the data term counts in units of the noise, u in natural logarithms.
+//!
+//! Residuals far from the solution speak of the start and not of a frame's TSF, so the residual-driven weights begin once
+//! an outer step lowers the objective by less than `settled` of it. The iteration stops when a step under these weights lowers
+//! it by less than `tolerance` of it, or at `outer` steps.
 
 use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget, channels,
-    partials_1d, partials_2d,
+    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget,
+    channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use serde::Serialize;
@@ -53,8 +58,8 @@ pub struct Settings {
     pub tolerance: f64,
     /// Strength of the residual-driven weights of blurred frames; 0: none.
     pub robust: f32,
-    /// Outer iterations before the residual-driven weights: at the start residuals speak of the start, not of the frame.
-    pub robust_after: usize,
+    /// Relative fall of the objective in an outer step below which the residual-driven weights begin; infinity: from the first.
+    pub settled: f64,
     /// Whether data weights follow the estimate; `false` freezes those of the start.
     pub reweight: bool,
     /// Interpolation of the warps.
@@ -64,13 +69,13 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            lambda: 3.0,
+            lambda: 2.5,
             epsilon: 0.01,
-            outer: 2,
+            outer: 8,
             inner: 16,
-            tolerance: 1e-4,
+            tolerance: 1e-2,
             robust: 1.0,
-            robust_after: 1,
+            settled: 0.6,
             reweight: true,
             interpolation: Interpolation::default(),
         }
@@ -125,6 +130,14 @@ pub struct Solution {
 }
 
 impl Solution {
+    /// Irradiance on the frame's grid plus `pad` pixels on every side; beyond what was solved for, that of the nearest pixel.
+    pub fn with_pad(&self, pad: usize) -> Rgb {
+        let (w, h) = self.irradiance.size();
+        let own = self.pad as isize - pad as isize;
+        let (w, h) = (w - 2 * self.pad + 2 * pad, h - 2 * self.pad + 2 * pad);
+        self.irradiance.map_planes(|p| Plane::from_fn(w, h, |x, y| p.clamped(x as isize + own, y as isize + own)))
+    }
+
     /// Irradiance on the frame's grid alone.
     pub fn cropped(&self) -> Rgb {
         let (w, h) = self.irradiance.size();
@@ -133,26 +146,45 @@ impl Solution {
 }
 
 /// Pixels by which the latent grid must surround the frame so that no pose of `tsfs` looks beyond it, at most `limit`.
+///
+/// A frame that is displaced as a whole counts by how far its poses spread: what it shows beyond the reference no other frame confirms, and
+/// an estimate of it from two steps would be wrong by more than the frame's noise. Its pixels that look there are masked.
 pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usize {
     let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(i, j)| glam::DVec2::new(i * x, j * y));
     let mut worst = 0.0f64;
     for tsf in tsfs.iter().filter(|t| !t.is_identity()) {
+        let centre = tsf.centre();
+        let displaced = corners.iter().any(|&c| (crate::pose::project(&centre, c) - c).length() > DISPLACED);
         for pose in &tsf.poses {
-            let inverse = pose.homography(tsf.focal_px).inverse();
-            for (i, j) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
-                let p = crate::pose::project(&inverse, glam::DVec2::new(i * x, j * y));
+            let mut back = (pose.homography(tsf.focal_px) * tsf.base).inverse();
+            if displaced || tsf.poses.len() == 1 {
+                back = centre * back;
+            }
+            for corner in corners {
+                let p = crate::pose::project(&back, corner);
                 worst = worst.max(p.x.abs() - x).max(p.y.abs() - y);
             }
         }
     }
-    if worst == 0.0 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
+    if worst < 1e-6 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
 }
+
+/// Displacement in pixels from which a frame counts as displaced rather than shaken.
+const DISPLACED: f64 = 4.0;
 
 struct Moving {
     blur: Blur,
+    still: bool,
     energy: f32,
     weight: Channels,
     observation: Channels,
+}
+
+impl Moving {
+    fn of<'k>(&self, kernels: &'k Kernels) -> &'k BlurKernels {
+        if self.still { &kernels.still } else { &kernels.blur }
+    }
 }
 
 struct Observed {
@@ -250,12 +282,14 @@ impl<'a> Solver<'a> {
         check(observations, initial)?;
         let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
         let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
-        let blurs: Vec<Option<(Blur, f32)>> = observations
+        let blurs: Vec<Option<(Blur, bool, f32)>> = observations
             .iter()
             .map(|o| {
                 (!o.tsf.is_identity()).then(|| {
                     let taps = TapSet::new(&o.tsf, frame.0, frame.1, settings.interpolation);
-                    (Blur::new(gpu, &kernels.blur, &taps, frame, pad), taps.energy() as f32)
+                    let still = o.tsf.single().is_some();
+                    let compiled = if still { &kernels.still } else { &kernels.blur };
+                    (Blur::new(gpu, compiled, &taps, frame, pad), still, taps.energy() as f32)
                 })
             })
             .collect();
@@ -293,7 +327,9 @@ impl<'a> Solver<'a> {
         for (o, blur) in observations.iter().zip(blurs) {
             let moving = match blur {
                 None => None,
-                Some((blur, energy)) => Some(Moving { blur, energy, weight: ch("weights", m)?, observation: ch("observations", m)? }),
+                Some((blur, still, energy)) => {
+                    Some(Moving { blur, still, energy, weight: ch("weights", m)?, observation: ch("observations", m)? })
+                }
             };
             observed.push(Observed {
                 exposure: upload_rgb(gpu, "exposure", &o.exposure)?,
@@ -314,7 +350,7 @@ impl<'a> Solver<'a> {
         let ones: Channels = std::array::from_fn(|_| one.clone());
         for (o, observed) in self.observations.iter().zip(&mut self.observed) {
             if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &self.state.scratch, &ones, &self.state.predicted));
+                self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &self.state.scratch, &ones, &self.state.predicted));
                 let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
                 let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
                 observed.mask = self.gpu.upload("mask", &mask)?;
@@ -359,7 +395,7 @@ impl<'a> Solver<'a> {
                     first = false;
                 }
                 Some(moving) => {
-                    steps.extend(moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+                    steps.extend(moving.blur.forward(self.gpu, moving.of(self.kernels), &s.scratch, &s.irradiance, &s.predicted));
                     steps.extend(data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch));
                     let to = WeightTarget {
                         weight: &moving.weight,
@@ -386,14 +422,14 @@ impl<'a> Solver<'a> {
             partial += partials_1d(n);
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.irradiance, &s.predicted));
+            steps.extend(moving.blur.forward(self.gpu, moving.of(k), &s.scratch, &s.irradiance, &s.predicted));
             for c in 0..3 {
                 let (w, o) = (&moving.weight[c], &moving.observation[c]);
                 steps.push(k.data.residual(self.gpu, &s.predicted[c], w, o, &s.frame[c], &s.partials, partial, m));
                 partial += partials_1d(m);
             }
             if project_back {
-                steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.frame, &s.back, 1.0));
+                steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &s.frame, &s.back, 1.0));
             }
         }
         steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, partial, SLOT_DATA, false));
@@ -415,7 +451,7 @@ impl<'a> Solver<'a> {
         let n = self.latent.0 * self.latent.1;
         let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &moving.weight, &s.data_diagonal, moving.energy));
+            steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &moving.weight, &s.data_diagonal, moving.energy));
         }
         for c in 0..3 {
             steps.push(k.linear.right_side(
@@ -454,11 +490,11 @@ impl<'a> Solver<'a> {
             steps.push(k.linear.scale(self.gpu, &s.irradiance[c], &s.direction[c], &s.weight[c], &s.scaled[c], &s.back[c], n));
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, &k.blur, &s.scratch, &s.scaled, &s.predicted));
+            steps.extend(moving.blur.forward(self.gpu, moving.of(k), &s.scratch, &s.scaled, &s.predicted));
             for c in 0..3 {
                 steps.push(k.linear.multiply(self.gpu, &moving.weight[c], &s.predicted[c], self.frame.0 * self.frame.1));
             }
-            steps.extend(moving.blur.adjoint(self.gpu, &k.blur, &s.scratch, &s.predicted, &s.back, 1.0));
+            steps.extend(moving.blur.adjoint(self.gpu, moving.of(k), &s.scratch, &s.predicted, &s.back, 1.0));
         }
         for c in 0..3 {
             let partial = c * partials_2d(self.latent);
@@ -518,9 +554,10 @@ impl<'a> Solver<'a> {
         let keep: Vec<Step> = (0..3).map(|c| Step::Copy(s.log[c].clone(), s.old[c].clone())).collect();
         let mut history = Vec::new();
         let mut stop = Stop::IterationLimit;
+        let mut settled = set.robust == 0.0 || set.settled == f64::INFINITY;
         for outer in 0..set.outer {
             if outer == 0 || set.reweight {
-                self.gpu.submit(if outer < set.robust_after { &trusting } else { &weigh });
+                self.gpu.submit(if settled { &weigh } else { &trusting });
             }
             self.gpu.submit(&residuals);
             self.gpu.submit(&edges);
@@ -555,10 +592,11 @@ impl<'a> Solver<'a> {
                 stop = Stop::Breakdown;
                 break;
             }
-            if before - after < set.tolerance * before.abs() {
+            if settled && before - after < set.tolerance * before.abs() {
                 stop = Stop::Converged;
                 break;
             }
+            settled |= before - after < set.settled * before.abs();
         }
         self.finish(history, stop)
     }
@@ -568,7 +606,7 @@ impl<'a> Solver<'a> {
         let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
         for (i, observed) in self.observed.iter().enumerate() {
             if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(self.gpu, &self.kernels.blur, &s.scratch, &s.irradiance, &s.predicted));
+                self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &s.scratch, &s.irradiance, &s.predicted));
             }
             let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);
             self.gpu.submit(&steps[..1]);

@@ -274,7 +274,7 @@ impl LinearKernels {
         self.cg_scalars.step(gpu, &params, &[partials, scalars], [1, 1, 1])
     }
 
-    /// u = `old` + clamp(`step` · `solution`, -1, 1), E = exp(u).
+    /// E = exp(`old`) · (1 + x) where x = `step` · `solution` is positive (at most fourfold), · exp(x) elsewhere (at least 1 / e); u = ln E.
     pub fn update(
         &self,
         gpu: &Gpu,

@@ -22,10 +22,16 @@ pub fn channels(gpu: &Gpu, label: &str, count: usize) -> crate::error::Result<Ch
     Ok([gpu.plane(label, count)?, gpu.plane(label, count)?, gpu.plane(label, count)?])
 }
 
+/// Interpolation of the one warp of a displaced sharp frame, whatever that of the blurred ones. Their poses are refined under their own
+/// interpolation, which makes up for part of its error; one pose cannot.
+pub const STILL: Interpolation = Interpolation::SixPoint;
+
 /// All kernels, compiled once per device.
 pub struct Kernels {
     /// K and Kᵀ.
     pub blur: BlurKernels,
+    /// The same for sharp frames that are displaced.
+    pub still: BlurKernels,
     /// Data weights and residuals.
     pub data: DataKernels,
     /// Smoothness and conjugate gradients.
@@ -33,9 +39,14 @@ pub struct Kernels {
 }
 
 impl Kernels {
-    /// Compiles everything; warps use `interpolation`.
+    /// Compiles everything; warps of blurred frames use `interpolation`, those of sharp ones [`STILL`].
     pub fn new(gpu: &Gpu, interpolation: Interpolation) -> Self {
-        Self { blur: BlurKernels::new(gpu, interpolation), data: DataKernels::new(gpu), linear: LinearKernels::new(gpu) }
+        Self {
+            blur: BlurKernels::new(gpu, interpolation),
+            still: BlurKernels::new(gpu, STILL),
+            data: DataKernels::new(gpu),
+            linear: LinearKernels::new(gpu),
+        }
     }
 }
 

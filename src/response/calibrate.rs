@@ -198,7 +198,7 @@ fn extend_bright_end(g: &mut [f64]) {
 
 /// The nearest sequence, in the least-squares sense, that rises by at least [`LEAST_RISE`] from code to code: pool
 /// adjacent violators.
-fn make_monotone(g: &mut [f64]) {
+pub(super) fn make_monotone(g: &mut [f64]) {
     g.iter_mut().enumerate().for_each(|(z, g)| *g -= LEAST_RISE * z as f64);
     let mut pools: Vec<(f64, usize)> = Vec::with_capacity(g.len());
     for &v in g.iter() {

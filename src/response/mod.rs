@@ -1,10 +1,15 @@
 //! Camera response f and its inverse: irradiance B = f⁻¹(Z)/Δt (section II-A). No blur.
 
+mod automatic;
 mod calibrate;
 mod file;
+mod mitsunaga;
+mod shades;
 
+pub use automatic::{Automatic, DISAGREEMENT_EV, ExposureCheck, automatic, check_exposures};
 pub use calibrate::calibrate;
 pub use file::{InverseTables, Provenance, ResponseFile};
+pub use mitsunaga::{Polynomial, mitsunaga};
 
 use crate::error::{Error, Result};
 

@@ -86,7 +86,7 @@ impl Tremor {
 
 /// The TSF of a frame of `width` pixels that did not move.
 pub fn identity(width: usize) -> Tsf {
-    Tsf { focal_px: focal_px(width), poses: vec![Pose::IDENTITY] }
+    Tsf { focal_px: focal_px(width), ..Tsf::identity() }
 }
 
 /// Focal length of the camera, pixels: a normal lens.

@@ -124,21 +124,30 @@ fn halve(p: &Plane) -> Plane {
 
 fn scaled(tsf: &Tsf, factor: f64) -> Tsf {
     let poses = tsf.poses.iter().map(|p| Pose { t_x: p.t_x * factor, t_y: p.t_y * factor, ..*p }).collect();
-    Tsf { focal_px: tsf.focal_px * factor, poses }
+    Tsf { focal_px: tsf.focal_px * factor, poses, base: DMat3::IDENTITY }
 }
 
-/// Largest extent in pixels, over corners and centre, of what the TSF does to a point.
+/// Extent in pixels, the largest over corners and centre, of what the TSF does to a point: all but the outermost hundredth of its time on
+/// either side, since a stray pose of next to no weight is not blur.
 pub fn extent(tsf: &Tsf, width: usize, height: usize) -> f64 {
     let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let span = |mut along: Vec<(f64, f64)>| {
+        along.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut before = 0.0;
+        let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
+        for (v, w) in along {
+            if before + w > 0.01 && before < 0.99 {
+                (lo, hi) = (lo.min(v), hi.max(v));
+            }
+            before += w;
+        }
+        (hi - lo).max(0.0)
+    };
     let mut worst = 0.0f64;
     for (i, j) in [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
         let p = glam::DVec2::new(i * x, j * y);
-        let (mut lo, mut hi) = (glam::DVec2::INFINITY, glam::DVec2::NEG_INFINITY);
-        for pose in &tsf.poses {
-            let q = pose.apply(tsf.focal_px, p);
-            (lo, hi) = (lo.min(q), hi.max(q));
-        }
-        worst = worst.max((hi - lo).max_element());
+        let moved: Vec<(glam::DVec2, f64)> = tsf.poses.iter().map(|pose| (pose.apply(tsf.focal_px, p), pose.weight)).collect();
+        worst = worst.max(span(moved.iter().map(|m| (m.0.x, m.1)).collect())).max(span(moved.iter().map(|m| (m.0.y, m.1)).collect()));
     }
     worst
 }
@@ -277,7 +286,8 @@ impl WholeFrame<'_> {
             }
             l -= 1;
         }
-        Some(choose(&level(l), l, &tsf, focal, search))
+        let found = choose(&level(l), l, &tsf, focal, search);
+        Some(Estimate { tsf: found.tsf.about(self.base), ..found })
     }
 
     /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model.
@@ -294,7 +304,7 @@ impl WholeFrame<'_> {
         let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
         let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart) else { return tsf.clone() };
         let rows = frame.rows(ROWS, margin(&start, size));
-        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale)
+        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale).about(self.base)
     }
 
     /// The coarser levels of the pyramid: 1/2, 1/4, ...

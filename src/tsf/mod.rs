@@ -16,6 +16,7 @@ pub use whole_frame::WholeFrame;
 
 use crate::error::{Error, Result};
 use crate::pose::Pose;
+use glam::DMat3;
 use serde::{Deserialize, Serialize};
 
 /// The TSF h_T of one frame: sparse poses whose weights sum to 1.
@@ -25,6 +26,9 @@ pub struct Tsf {
     pub focal_px: f64,
     /// The poses; weights positive, sum 1.
     pub poses: Vec<Pose>,
+    /// Motion of the frame as a whole, from the latent scene on the reference's grid to the grid about which the poses move (centred
+    /// pixels): a pose takes the scene point p to Γ(base p). The identity for frames that lie on the reference.
+    pub base: DMat3,
 }
 
 impl Tsf {
@@ -47,17 +51,41 @@ impl Tsf {
             return Err(Error::Input("a TSF needs at least one pose with a positive weight".into()));
         }
         let poses = poses.into_iter().filter(|p| p.weight > 0.0).map(|p| Pose { weight: p.weight / sum, ..p }).collect();
-        Ok(Self { focal_px, poses })
+        Ok(Self { focal_px, poses, base: DMat3::IDENTITY })
+    }
+
+    /// The same poses about another motion of the frame as a whole.
+    #[must_use]
+    pub fn about(self, base: DMat3) -> Self {
+        Self { base, ..self }
+    }
+
+    /// The TSF of a frame that is sharp and displaced by `motion` (frame from reference, centred pixels).
+    pub fn still(motion: DMat3) -> Self {
+        Self::identity().about(motion)
     }
 
     /// The TSF of a frame that is sharp and in place.
     pub fn identity() -> Self {
-        Self { focal_px: 1000.0, poses: vec![Pose::IDENTITY] }
+        Self { focal_px: 1000.0, poses: vec![Pose::IDENTITY], base: DMat3::IDENTITY }
     }
 
     /// Whether the frame is the latent scene itself (single pose, nothing moves).
     pub fn is_identity(&self) -> bool {
-        matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
+        self.base == DMat3::IDENTITY && matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
+    }
+
+    /// Where the frame of a single pose lies (frame from reference, centred pixels); `None` for a blurred frame.
+    pub fn single(&self) -> Option<DMat3> {
+        match self.poses.as_slice() {
+            [p] => Some(p.homography(self.focal_px) * self.base),
+            _ => None,
+        }
+    }
+
+    /// Motion of the mean pose (frame from reference, centred pixels).
+    pub fn centre(&self) -> DMat3 {
+        self.mean().homography(self.focal_px) * self.base
     }
 
     /// Weighted mean pose: (t_x, t_y) in pixels, (θ_x, θ_y, θ_z) in degrees.
@@ -87,6 +115,17 @@ pub struct TsfEntry {
     pub focal_px: f64,
     /// The poses.
     pub poses: Vec<Pose>,
+    /// Motion of the frame as a whole before the poses (see [`Tsf::base`]), row by row; left out where it is the identity.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub base: Option<[[f64; 3]; 3]>,
+}
+
+impl TsfEntry {
+    /// The entry of the frame `name` of `width` x `height` pixels.
+    pub fn new(name: &str, width: usize, height: usize, tsf: &Tsf) -> Self {
+        let base = (tsf.base != DMat3::IDENTITY).then(|| tsf.base.transpose().to_cols_array_2d());
+        Self { frame: name.into(), width, height, focal_px: tsf.focal_px, poses: tsf.poses.clone(), base }
+    }
 }
 
 /// A TSF file: `{"format":"unshaken-tsf","version":1,"frames":[...]}`.
@@ -137,6 +176,11 @@ impl TsfFile {
         if (e.width, e.height) != (width, height) {
             return Err(Error::Input(format!("TSF of {name} is for {} x {} pixels, the frame is {width} x {height}", e.width, e.height)));
         }
-        Tsf::new(e.focal_px, e.poses.clone()).map(Some).map_err(|x| Error::Input(format!("TSF of {name}: {x}")))
+        let base = e.base.map_or(DMat3::IDENTITY, |b| DMat3::from_cols_array_2d(&b).transpose());
+        let sound = base.is_finite() && base.determinant().abs() > 1e-3 && base.z_axis.z.abs() > 1e-3;
+        if !sound {
+            return Err(Error::Input(format!("TSF of {name}: its base is no homography that can be undone")));
+        }
+        Tsf::new(e.focal_px, e.poses.clone()).map(|t| Some(t.about(base))).map_err(|x| Error::Input(format!("TSF of {name}: {x}")))
     }
 }

@@ -96,6 +96,9 @@ const NEGLIGIBLE: f64 = 5e-4;
 impl TapSet {
     /// The taps of `tsf` on a `width` x `height` frame.
     pub fn new(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
+        if let Some(motion) = tsf.single().filter(|_| !tsf.is_identity()) {
+            return Self::still(&motion);
+        }
         let flat = tsf.poses.iter().all(|p| p.theta_x_deg == 0.0 && p.theta_y_deg == 0.0);
         let (bases, parts) = if flat { roll_bases(tsf, width, height) } else { general_bases(tsf, width, height) };
         let mut grid: BTreeMap<(usize, i32, i32), f64> = BTreeMap::new();
@@ -107,6 +110,13 @@ impl TapSet {
         let sum: f64 = grid.values().sum();
         let taps = grid.iter().map(|(&(base, dy, dx), &w)| Tap { base, dx, dy, weight: w / sum }).collect();
         Self { bases, taps }
+    }
+
+    /// A sharp frame displaced by `motion`: all of it in one warp, which interpolates once, but for whole pixels, which cost nothing.
+    fn still(motion: &DMat3) -> Self {
+        let shift = project(motion, DVec2::ZERO).round();
+        let tap = Tap { base: 0, dx: shift.x as i32, dy: shift.y as i32, weight: 1.0 };
+        Self { bases: vec![DMat3::from_translation(-shift) * *motion], taps: vec![tap] }
     }
 
     /// Sum of the squared weights of the PSF that the taps make near the frame's centre.
@@ -142,7 +152,7 @@ fn roll_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
     let (lo, hi) = tsf.poses.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), p| (a.min(p.theta_z_deg), b.max(p.theta_z_deg)));
     let steps = ((hi - lo).to_radians() * corner / TOLERANCE).ceil() as usize;
     let step = if steps == 0 { 1.0 } else { (hi - lo) / steps as f64 };
-    let bases = (0..=steps).map(|i| Pose::planar(0.0, 0.0, lo + i as f64 * step, 1.0).rotation(tsf.focal_px)).collect();
+    let bases = (0..=steps).map(|i| Pose::planar(0.0, 0.0, lo + i as f64 * step, 1.0).rotation(tsf.focal_px) * tsf.base).collect();
     let mut parts = Vec::new();
     for p in &tsf.poses {
         let i = ((p.theta_z_deg - lo) / step).round().clamp(0.0, steps as f64) as usize;
@@ -179,5 +189,5 @@ fn general_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
         };
         parts.push((base, DVec2::new(p.t_x, p.t_y) + shift, p.weight));
     }
-    (bases, parts)
+    (bases.into_iter().map(|h| h * tsf.base).collect(), parts)
 }

@@ -23,7 +23,7 @@ pub struct WholeFrame<'a> {
     pub blurred: &'a Plane,
     /// Inverse variance of the frame's pixels, model error included; 0: masked.
     pub weight: &'a Plane,
-    /// Where the frame lies on the latent grid before it moves (frame from latent, centred pixels): every pose comes after it.
+    /// Motion of the frame as a whole, about which the poses are looked for (see [`Tsf::base`]).
     pub base: DMat3,
 }
 
@@ -78,18 +78,12 @@ impl WholeFrame<'_> {
         self.blurred.size()
     }
 
-    /// The latent irradiance where the frame would lie if it did not move: on the frame's grid.
-    pub fn aligned(&self) -> Plane {
-        if self.base == DMat3::IDENTITY && self.pad == 0 {
-            return self.latent.clone();
-        }
-        warp(self.latent, self.pad, self.size(), 0, &self.base, Interpolation::Bicubic)
-    }
-
     /// The `count` differences, at least `margin` pixels from the border, with most noise-weighted structure.
     pub(super) fn rows(&self, count: usize, margin: usize) -> Vec<Row> {
         let (w, h) = self.size();
         let mut rows: Vec<(f32, Row)> = Vec::new();
+        let moved = (self.base != DMat3::IDENTITY).then(|| warp(self.latent, self.pad, (w, h), 0, &self.base, Interpolation::Bilinear));
+        let latent = |x: usize, y: usize| moved.as_ref().map_or_else(|| self.latent.at(x + self.pad, y + self.pad), |m| m.at(x, y));
         for y in margin..h.saturating_sub(margin) {
             for x in margin..w.saturating_sub(margin) {
                 for vertical in [false, true] {
@@ -101,7 +95,7 @@ impl WholeFrame<'_> {
                     let (a, b) = (self.weight.at(x, y), self.weight.at(i, j));
                     if a > 0.0 && b > 0.0 {
                         let k = a * b / (a + b);
-                        let e = self.latent.at(i + self.pad, j + self.pad) - self.latent.at(x + self.pad, y + self.pad);
+                        let e = latent(i, j) - latent(x, y);
                         let d = self.blurred.at(i, j) - self.blurred.at(x, y);
                         rows.push((k * (e * e + d * d), Row { weight: k, ..row }));
                     }
@@ -137,16 +131,8 @@ impl WholeFrame<'_> {
         let bases: Vec<Plane> = grid
             .angles_deg
             .iter()
-            .map(|a| {
-                warp(
-                    self.latent,
-                    self.pad,
-                    (w, h),
-                    r,
-                    &(Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal) * self.base),
-                    Interpolation::Bicubic,
-                )
-            })
+            .map(|a| Pose::planar(0.0, 0.0, *a, 1.0).rotation(focal) * self.base)
+            .map(|m| warp(self.latent, self.pad, (w, h), r, &m, Interpolation::Bicubic))
             .collect();
         let fft = Fft2::new(w + 2 * r, h + 2 * r);
         let spectra: Vec<Spectrum> = bases.par_iter().map(|b| fft.forward(&b.data, b.width)).collect();
@@ -212,6 +198,6 @@ impl WholeFrame<'_> {
                 Pose::planar((id % n) as f64 - r as f64, (id / n % n) as f64 - r as f64, grid.angles_deg[id / (n * n)], weight)
             })
             .collect();
-        Tsf::new(focal, poses).ok()
+        Tsf::new(focal, poses).ok().map(|t| t.about(self.base))
     }
 }

@@ -161,3 +161,8 @@ impl Problem {
         b
     }
 }
+
+/// Log irradiance `u` after the step `d`: E (1 + d) upwards, at most fourfold; E exp(d) downwards, at least E / e.
+pub fn advance(u: f64, d: f64) -> f64 {
+    u + if d > 0.0 { (1.0 + d).min(4.0).ln() } else { d.max(-1.0) }
+}

@@ -22,6 +22,8 @@ mod kernels;
 mod layers;
 /// Quality measures against stored values of an independent implementation.
 mod metrics;
+/// Registration: motions planted in drawn scenes, what is refused.
+mod register;
 /// Response: calibration against truth and against OpenCV, response files.
 mod response;
 /// What naga says of the shaders, without a GPU.

@@ -4,7 +4,8 @@ use crate::support::files::{Noise, scene, shared};
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
 use unshaken::io::{ldr, metadata};
-use unshaken::response::{Provenance, Response, ResponseFile, calibrate};
+use unshaken::response::{DISAGREEMENT_EV, Provenance, Response, ResponseFile, automatic, calibrate, check_exposures, mitsunaga};
+use unshaken::synth::{self, Camera, Tremor};
 
 /// ln f⁻¹ at the 256 codes, 0 at 128.
 fn ln_table(response: &Response, channel: usize) -> Vec<f64> {
@@ -169,4 +170,123 @@ fn response_files_keep_the_tables_and_other_files_are_refused() {
         let error = ResponseFile::parse(&text).unwrap_err().to_string();
         assert!(error.contains(expected) && error.contains("unshaken calibrate"), "{error}");
     }
+}
+
+/// The film-like curve as a response.
+fn film_response() -> Response {
+    let g = true_ln_table(film);
+    let table: Vec<f64> = g.iter().map(|v| (v - g[255]).exp()).collect();
+    Response::Table([table.clone(), table.clone(), table])
+}
+
+/// A room through a film-like camera, the last of four frames shaken; and the true curve.
+fn shaken_bracket() -> Bracket {
+    let camera = Camera { full_well: 6000.0, read_noise: 6.0, response: film_response() };
+    let tremor = Tremor { extent_px: 8.0, roll_deg: 0.6, offset_px: 1.5, offset_deg: 0.0 };
+    let times = [(0.02, None), (0.06, None), (0.2, None), (0.6, Some(tremor))];
+    synth::capture(&synth::room(240, 180, 24, 3), &camera, &times, 0.5, 5).unwrap().bracket
+}
+
+/// `bracket` with the times of frames multiplied.
+fn with_times(bracket: &Bracket, factors: &[f64]) -> Bracket {
+    let frames = bracket.frames().iter().zip(factors).map(|(f, k)| Frame { exposure_time: f.exposure_time * k, ..f.clone() });
+    Bracket::new(frames.collect()).unwrap()
+}
+
+#[test]
+fn the_curve_is_found_from_shaken_frames() {
+    let found = automatic(&shaken_bracket()).unwrap();
+    assert_rises(&found.response);
+    assert!(found.poor.is_none() && found.exposures.suspects().is_empty(), "{found:?}");
+    let truth = true_ln_table(film);
+    for c in 0..3 {
+        let g = ln_table(&found.response, c);
+        let worst = [difference(&g, &truth, 20, 235), difference(&g, &truth, 8, 250)];
+        println!("channel {c}: {worst:.3?}, {}", found.method);
+        assert!(worst[0] < 0.08 && worst[1] < 0.2, "channel {c}: {worst:.3?}");
+    }
+}
+
+#[test]
+fn a_wrong_exposure_time_is_named_with_its_error() {
+    let bracket = shaken_bracket();
+    // Half an EV, and the tenth of an EV that cameras round: only the one is worth a word.
+    for (wrong, ev) in [(1, 0.5f64), (2, -0.5), (2, 0.09)] {
+        let mut factors = [1.0; 4];
+        factors[wrong] = ev.exp2();
+        let given = with_times(&bracket, &factors);
+        for check in [automatic(&given).unwrap().exposures, check_exposures(&given, &film_response())] {
+            let seen = format!("frame {wrong} by {ev} EV: {check:.3?}");
+            if ev.abs() < DISAGREEMENT_EV {
+                assert!(check.warning(&given).is_none(), "{seen}");
+                continue;
+            }
+            assert_eq!(check.suspects(), [wrong], "{seen}");
+            assert!((check.difference_ev[wrong].unwrap() + ev).abs() < 0.1, "{seen}");
+            let text = check.warning(&given).unwrap();
+            let sign = if ev > 0.0 { "-0." } else { "+0." };
+            assert!(text.contains(&format!("frame{}.png {sign}", wrong + 1)) && text.contains("--exposures"), "{text}");
+        }
+    }
+}
+
+#[test]
+fn few_shades_give_a_gamma_and_say_so() {
+    // Eleven patches of 8 x 8 px in three channels, through a gamma of 1.8.
+    let frames = [0.1, 0.3].map(|exposure_time: f64| {
+        let plane = Plane::from_fn(48, 48, |x, y| {
+            let e = 0.2 + 0.05 * ((x / 16) as f64 + 3.0 * (y / 16) as f64);
+            (((e * exposure_time * 4.0).min(1.0).powf(1.0 / 1.8) * 255.0).round() / 255.0) as f32
+        });
+        Frame { name: "patches".into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 255, exposure_time }
+    });
+    let found = automatic(&Bracket::new(frames.to_vec()).unwrap()).unwrap();
+    assert!(found.poor.as_ref().is_some_and(|p| p.contains("gamma")), "{found:?}");
+    let exponent = found.response.inverse(1, 128.0 / 255.0).ln() / (128.0f64 / 255.0).ln();
+    assert!((exponent - 1.8).abs() < 0.1, "{exponent}");
+    // Without a pair of frames that share shades there is nothing to go by.
+    let frame = |value: f32, exposure_time| Frame { name: "one".into(), intensity: Rgb::filled(48, 48, value), levels: 255, exposure_time };
+    let error = automatic(&Bracket::new(vec![frame(0.0, 0.01), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
+    assert!(error.contains("--response"), "{error}");
+}
+
+#[test]
+fn polynomials_find_the_curve_and_a_wrong_time() {
+    let mut frames = noisy_bracket(film, 160, 120, 12000.0, 6.0).frames().to_vec();
+    let between = noisy_bracket(film, 160, 120, 12000.0, 6.0);
+    frames.extend(between.frames().iter().skip(1).cloned());
+    // Times 1/60, 1/15, 1/2 s and the last two again: the second frame's is noted wrong by 0.4 EV.
+    frames[1].exposure_time *= 0.4f64.exp2();
+    let bracket = Bracket::new(frames).unwrap();
+    let found = mitsunaga(&bracket).unwrap();
+    let ev: Vec<f64> = found.exposure_times.iter().zip(bracket.frames()).map(|(t, f)| (t / f.exposure_time).log2()).collect();
+    println!("{ev:.3?}, degree {}", found.degree);
+    for (i, e) in ev.iter().enumerate() {
+        assert!((e + if i == 1 { 0.4 } else { 0.0 }).abs() < 0.05, "{ev:.3?}");
+    }
+    assert_rises(&found.response);
+    let truth = true_ln_table(film);
+    for c in 0..3 {
+        let worst = difference(&ln_table(&found.response, c), &truth, 30, 235);
+        println!("channel {c}: {worst:.3}");
+        assert!(worst < 0.12, "channel {c}: {worst:.3}");
+    }
+}
+
+/// Times from EXIF are nominal: up to 0.1 EV from the truth, which is no reason for a warning.
+#[test]
+fn correct_real_brackets_raise_no_alarm() {
+    let Some(folder) = shared("data/brackets/lighthouse") else { return };
+    let frames = ["A", "B", "C"].map(|n| {
+        let path = folder.join(format!("{n}.jpg"));
+        let picture = ldr::read(&path).unwrap();
+        let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
+        Frame { name: n.into(), intensity: picture.intensity, levels: picture.levels, exposure_time }
+    });
+    let bracket = Bracket::new(frames.to_vec()).unwrap();
+    let found = automatic(&bracket).unwrap();
+    assert_rises(&found.response);
+    assert_eq!(found.exposures.warning(&bracket), None);
+    // The frames are brighter in the shadows and flatter in the highlights than sRGB, which must show.
+    assert!(check_exposures(&bracket, &Response::Srgb).warning(&bracket).is_some());
 }

@@ -1,7 +1,7 @@
 //! The solver against dense algebra on a bracket of a hundred pixels, and what it promises: descent, stopping, cancelling.
 
 use crate::oracle::blur;
-use crate::oracle::solver::{Frame, Planes, Problem, Weights};
+use crate::oracle::solver::{Frame, Planes, Problem, Weights, advance};
 use crate::support::gpu::{gpu, kernels};
 use crate::support::{f64s, noise};
 use glam::DMat3;
@@ -86,7 +86,7 @@ fn start(pad: usize) -> Rgb {
 }
 
 fn settings() -> Settings {
-    Settings { lambda: 2.0, epsilon: 0.05, robust_after: 0, interpolation: INTERPOLATION, ..Settings::default() }
+    Settings { lambda: 2.0, epsilon: 0.05, settled: f64::INFINITY, interpolation: INTERPOLATION, ..Settings::default() }
 }
 
 fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Settings) -> Solution {
@@ -151,7 +151,7 @@ fn check_step(pad: usize, robust: f32, black_clipped: bool) {
     let largest = step.iter().flatten().fold(0.0f64, |a, v| a.max(v.abs()));
     assert!(largest > 0.05, "the start leaves nothing to do: {largest}");
     let expected: Planes =
-        std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| u + (f64::from(iteration.step) * d).clamp(-1.0, 1.0)).collect());
+        std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| advance(*u, f64::from(iteration.step) * d)).collect());
     for (c, got) in logs(&got.irradiance).iter().enumerate() {
         for (i, (got, expected)) in got.iter().zip(&expected[c]).enumerate() {
             // f32 conjugate gradients at a condition of 1e3 after the preconditioner, and weights good to 2e-5.
@@ -381,7 +381,7 @@ fn a_step_that_would_raise_the_objective_is_halved() {
     let log = logs(&run(&bracket, &initial, 1, &Settings { outer: k, ..set.clone() }).irradiance);
     let step = problem.step(&log, &weights);
     let at = |s: f64| {
-        let moved: Planes = std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| u + (s * d).clamp(-1.0, 1.0)).collect());
+        let moved: Planes = std::array::from_fn(|c| log[c].iter().zip(&step[c]).map(|(u, d)| advance(*u, s * d)).collect());
         problem.objective(&moved, &weights)
     };
     let (whole, damped, before) = (at(1.0), at(f64::from(history[k].step)), at(0.0));

@@ -2,6 +2,7 @@
 
 use crate::support::noise as numbers;
 use crate::support::texture;
+use glam::DMat3;
 use unshaken::exposure::Frame;
 use unshaken::image::{Plane, Rgb};
 use unshaken::mask;
@@ -58,7 +59,9 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         levels: 255,
         exposure_time,
     };
-    let one = |frames: &[Frame], sharp: &[bool]| mask::masks(frames, sharp, 0.3).iter().map(|m| m.data[0]).collect::<Vec<f32>>();
+    let one = |frames: &[Frame], sharp: &[bool]| {
+        mask::masks(frames, sharp, 0.3, &vec![DMat3::IDENTITY; frames.len()]).iter().map(|m| m.data[0]).collect::<Vec<f32>>()
+    };
     // A clipped red has a grey of 0.3, in the flat part of the window.
     assert_eq!(one(&[frame([1.0, 0.0, 0.0], 1.0)], &[true]), [0.0]);
     // The low taper applies only where a longer frame, at least as sharp, covers the pixel well.
@@ -66,6 +69,15 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     assert!(one(&[dark.clone(), longer.clone()], &[true, true])[0] < 0.5);
     assert_eq!(one(&[dark.clone(), longer], &[true, false]), [1.0, 1.0]);
     assert_eq!(one(&[dark, frame([1.0; 3], 1.0)], &[true, true]), [1.0, 0.0]);
+
+    // Covered is judged where the longer frame has the same point of the scene: here one pixel to the right.
+    let row = |values: [f32; 3], exposure_time| Frame {
+        intensity: Rgb([(); 3].map(|()| Plane { width: 3, height: 1, data: values.to_vec() })),
+        ..frame([0.0; 3], exposure_time)
+    };
+    let motions = [DMat3::IDENTITY, DMat3::from_translation(glam::DVec2::new(1.0, 0.0))];
+    let found = mask::masks(&[row([0.05; 3], 0.1), row([0.0, 0.4, 0.0], 1.0)], &[true, true], 0.3, &motions);
+    assert!(found[0].data[0] < 0.5 && found[0].data[1..] == [1.0, 1.0], "{found:?}");
 }
 
 #[test]
@@ -152,7 +164,7 @@ fn shaken_frames_are_told_from_sharp_ones() {
         let frames = made.bracket.frames();
         let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
         let level = noise::estimate(frames, &exposures, &Response::Srgb);
-        let found = triage::triage(frames, &exposures, &level, &[false; 3], None);
+        let found = triage::triage(frames, &exposures, &level, &[false; 3], None, &[DMat3::IDENTITY; 3]);
         assert_eq!(found.iter().map(|v| !v.sharp).collect::<Vec<_>>(), shaken, "{found:?}");
     }
 }

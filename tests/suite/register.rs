@@ -1,0 +1,196 @@
+//! Registration on frames whose motion is planted.
+
+use crate::support::noise as numbers;
+use glam::{DMat3, DVec2};
+use unshaken::exposure::{Bracket, Frame};
+use unshaken::image::{Plane, Rgb};
+use unshaken::noise;
+use unshaken::pose::{Pose, project};
+use unshaken::register::{self, Model, Registrar, Registration};
+use unshaken::response::Response;
+use unshaken::synth::{self, Camera, Scene, Tremor};
+use unshaken::tsf::{Interpolation, TapSet, Tsf, WholeFrame};
+
+const SIZE: (usize, usize) = (288, 208);
+
+fn scene(seed: u64) -> Scene {
+    synth::room(SIZE.0, SIZE.1, 32, seed)
+}
+
+/// Frames of `scene` through `tsfs`, at 1/30, 1/8, 1/2 s and so on, lit so that the middle one is well exposed.
+fn photographs(scene: &Scene, tsfs: &[Tsf]) -> Vec<Frame> {
+    let still = synth::expose(scene, &Tsf::identity());
+    let mut levels = still.mean().data;
+    let middle = levels.len() / 2;
+    let gain = 0.6 / *levels.select_nth_unstable_by(middle, f32::total_cmp).1;
+    tsfs.iter()
+        .enumerate()
+        .map(|(i, tsf)| {
+            let irradiance = synth::expose(scene, tsf).map_planes(|p| p.map(|v| v * gain));
+            Camera::default().photograph(&format!("frame{}.png", i + 1), &irradiance, 4f64.powi(i as i32) / 30.0, 17, i as u64)
+        })
+        .collect()
+}
+
+fn single(t_x: f64, t_y: f64, theta_z_deg: f64) -> Tsf {
+    Tsf::new(1.2 * SIZE.0 as f64, vec![Pose::planar(t_x, t_y, theta_z_deg, 1.0)]).unwrap()
+}
+
+/// Registrations of `frames` against the first.
+fn registrations(frames: Vec<Frame>, sharp: &[bool]) -> Vec<Registration> {
+    let bracket = Bracket::new(frames).unwrap();
+    let frames = bracket.frames();
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
+    let level = noise::estimate(frames, &exposures, &Response::Srgb);
+    let mut registrar = Registrar::new(frames, &exposures, &level, 0);
+    let mut found = vec![registrar.of_reference(); frames.len()];
+    let all: Vec<usize> = (0..frames.len()).collect();
+    for i in registrar.order(&all, sharp) {
+        found[i] = registrar.register(i, sharp[i]);
+    }
+    found
+}
+
+/// Root mean square distance over the frame of a motion from where `tsf` has its centroid.
+fn off(found: &Registration, tsf: &Tsf) -> f64 {
+    let (w, h) = (SIZE.0 as f64, SIZE.1 as f64);
+    let (mut sum, mut n) = (0.0, 0.0);
+    for j in -2..=2 {
+        for i in -2..=2 {
+            let p = DVec2::new(0.24 * w * f64::from(i), 0.24 * h * f64::from(j));
+            let centroid: DVec2 = tsf.poses.iter().map(|q| q.weight * q.apply(tsf.focal_px, p)).sum();
+            sum += (project(&found.motion(), p) - centroid).length_squared();
+            n += 1.0;
+        }
+    }
+    (sum / n).sqrt()
+}
+
+#[test]
+fn sharp_frames_are_found_to_a_fraction_of_a_pixel() {
+    let tsfs = [single(0.0, 0.0, 0.0), single(20.0, -9.3, 1.0), single(-13.7, 20.0, -0.6)];
+    let found = registrations(photographs(&scene(3), &tsfs), &[true; 3]);
+    for (r, tsf) in found.iter().zip(&tsfs) {
+        assert!(r.registered && off(r, tsf) < 0.1, "{:.3} px off: {r:?}", off(r, tsf));
+    }
+    assert!(found[1..].iter().all(|r| r.model == Model::Rigid), "{found:?}");
+}
+
+#[test]
+fn frames_from_a_tripod_stay_exactly_where_they_are() {
+    let found = registrations(photographs(&scene(4), &[single(0.0, 0.0, 0.0), single(0.0, 0.0, 0.0), single(0.0, 0.0, 0.0)]), &[true; 3]);
+    for r in found {
+        assert!(r.registered && r.model == Model::Identity && r.motion() == DMat3::IDENTITY, "{r:?}");
+    }
+}
+
+#[test]
+fn a_blurred_frame_is_placed_at_its_blurs_centroid() {
+    let path = Tremor { extent_px: 11.0, roll_deg: 0.8, offset_px: 0.0, offset_deg: 0.0 }.tsf(SIZE.0, SIZE.1, 0.5, 2, 5).unwrap();
+    let moved = path.poses.iter().map(|p| Pose { t_x: p.t_x + 15.0, t_y: p.t_y - 11.0, theta_z_deg: p.theta_z_deg + 0.5, ..*p }).collect();
+    let blurred = Tsf::new(path.focal_px, moved).unwrap();
+    let found = registrations(photographs(&scene(5), &[single(0.0, 0.0, 0.0), blurred.clone()]), &[true, false]);
+    assert!(found[1].registered && off(&found[1], &blurred) < 1.0, "{:.2} px off: {:?}", off(&found[1], &blurred), found[1]);
+}
+
+#[test]
+fn a_frame_of_another_scene_is_not_registered() {
+    let mut frames = photographs(&scene(6), &[single(0.0, 0.0, 0.0), single(4.0, 3.0, 0.2), single(0.0, 0.0, 0.0)]);
+    // Upside down and mirrored, the room is another scene under the same light.
+    let other = &mut frames[2];
+    other.intensity = other.intensity.map_planes(|p| Plane { data: p.data.iter().rev().copied().collect(), ..p.clone() });
+    for sharp in [true, false] {
+        let found = registrations(frames.clone(), &[true, true, sharp]);
+        assert!(found[1].registered && !found[2].registered, "{found:?}");
+        assert!(!found[2].reason.is_empty());
+    }
+}
+
+#[test]
+fn the_simplest_motion_that_explains_the_matches_is_chosen() {
+    let corner = 400.0;
+    for (model, motion) in [
+        (Model::Identity, DMat3::IDENTITY),
+        (Model::Translation, DMat3::from_translation(DVec2::new(12.0, -7.5))),
+        (Model::Rigid, DMat3::from_translation(DVec2::new(12.0, -7.5)) * DMat3::from_angle(0.02)),
+        (Model::Affine, DMat3::from_cols_array(&[1.01, 0.004, 0.0, -0.006, 0.995, 0.0, 9.0, 4.0, 1.0])),
+        (Model::Homography, DMat3::from_cols_array(&[1.004, 0.006, 4e-5, -0.006, 0.998, -3e-5, 9.0, 4.0, 1.0])),
+    ] {
+        let n = numbers(11, 6 * 120);
+        let pairs: Vec<register::Pair> = (0..120)
+            .map(|i| {
+                let v = |k: usize| f64::from(n[6 * i + k]);
+                let p = DVec2::new(320.0 * v(0), 240.0 * v(1));
+                // A third of the matches are mistaken, the rest good to a quarter of a pixel.
+                let q =
+                    if i % 3 == 0 { DVec2::new(320.0 * v(4), 240.0 * v(5)) } else { project(&motion, p) + 0.4 * DVec2::new(v(2), v(3)) };
+                (p, q)
+            })
+            .collect();
+        let found = register::consensus(&pairs, corner, Model::Homography).expect("two thirds agree");
+        let (rms, _) = register::distance(&found.motion, &motion, 640, 480);
+        assert!(found.model == model && rms < 0.25, "{model:?}: found {:?}, {rms:.3} px off", found.model);
+        assert!((78..=84).contains(&found.inliers), "{} of 80 inliers", found.inliers);
+    }
+    // Matches without a common motion.
+    let n = numbers(12, 4 * 60);
+    let random: Vec<register::Pair> = n
+        .chunks_exact(4)
+        .map(|v| {
+            let v: Vec<f64> = v.iter().map(|v| 200.0 * f64::from(*v)).collect();
+            (DVec2::new(v[0], v[1]), DVec2::new(v[2], v[3]))
+        })
+        .collect();
+    assert!(register::consensus(&random, corner, Model::Homography).is_none_or(|c| c.inliers < 8));
+}
+
+#[test]
+fn a_displaced_sharp_frame_is_one_warp_and_whole_pixels_are_exact() {
+    let whole = TapSet::new(&Tsf::still(DMat3::from_translation(DVec2::new(3.0, -2.0))), 64, 48, Interpolation::Bilinear);
+    assert_eq!((whole.taps.len(), whole.taps[0].dx, whole.taps[0].dy, whole.taps[0].weight), (1, 3, -2, 1.0));
+    assert_eq!(whole.bases, [DMat3::IDENTITY]);
+    let motion = DMat3::from_translation(DVec2::new(7.4, 0.3)) * DMat3::from_angle(0.01);
+    let taps = TapSet::new(&Tsf::still(motion), 64, 48, Interpolation::Bilinear);
+    assert_eq!(taps.taps.len(), 1);
+    let shift = DVec2::new(f64::from(taps.taps[0].dx), f64::from(taps.taps[0].dy));
+    for p in [DVec2::new(0.0, 0.0), DVec2::new(30.0, -20.0)] {
+        assert!((project(&taps.bases[0], p) + shift - project(&motion, p)).length() < 1e-9);
+    }
+}
+
+#[test]
+fn a_tsf_is_found_about_the_motion_of_its_frame() {
+    let (w, h) = (128, 96);
+    let n = numbers(7, (w + 64) * (h + 64));
+    let fine = Plane { width: w + 64, height: h + 64, data: n };
+    let latent = Plane::from_fn(w + 64, h + 64, |x, y| {
+        let at = |i: isize, j: isize| fine.clamped(x as isize + i, y as isize + j);
+        2.0 + (at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1) + at(-1, 0) + at(0, -1)) / 6.0
+    });
+    // 26 pixels away: far outside of the grid that is searched.
+    let base = DMat3::from_translation(DVec2::new(24.0, -10.0)) * DMat3::from_angle(0.02);
+    let truth = Tsf::new(150.0, vec![Pose::planar(0.0, 0.0, 0.0, 0.6), Pose::planar(3.0, 1.0, 0.0, 0.4)]).unwrap().about(base);
+    let centre = DVec2::new(0.5 * (w as f64 - 1.0), 0.5 * (h as f64 - 1.0));
+    let mut blurred = Plane::filled(w, h, 0.0);
+    for pose in &truth.poses {
+        let inverse = (pose.homography(truth.focal_px) * base).inverse();
+        for y in 0..h {
+            for x in 0..w {
+                let q = project(&inverse, DVec2::new(x as f64, y as f64) - centre) + centre + 32.0;
+                let (i, j) = (q.x.floor(), q.y.floor());
+                let (u, v) = ((q.x - i) as f32, (q.y - j) as f32);
+                let at = |a: isize, b: isize| latent.clamped(i as isize + a, j as isize + b);
+                let value = (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1));
+                blurred.data[y * w + x] += pose.weight as f32 * value;
+            }
+        }
+    }
+    let weight = Plane::filled(w, h, 1e5);
+    let frame = WholeFrame { latent: &latent, pad: 32, blurred: &blurred, weight: &weight, base };
+    let found = frame.fit_grid(&unshaken::pose::PoseGrid::new(w, h, 6, 0.5, 1.0), None).expect("something fits");
+    assert_eq!(found.base, base);
+    let refined = frame.refine(&found);
+    assert_eq!(refined.base, base);
+    let m = refined.mean();
+    assert!((m.t_x - 1.2).abs() < 0.1 && (m.t_y - 0.4).abs() < 0.1 && m.theta_z_deg.abs() < 0.05, "{m:?}");
+}
