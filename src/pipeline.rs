@@ -9,12 +9,12 @@ use crate::kernels::Kernels;
 use crate::mask;
 use crate::merge;
 use crate::noise::{self, NoiseModel};
-use crate::pose::{PoseGrid, project};
+use crate::pose::project;
 use crate::psf;
 use crate::register::{self, Registrar, Registration};
 use crate::response::Response;
 use crate::triage::{self, Verdict};
-use crate::tsf::{self, Interpolation, Tsf, TsfEntry, TsfFile, WholeFrame};
+use crate::tsf::{self, Interpolation, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -32,6 +32,12 @@ pub struct Settings {
     pub align: bool,
     /// α of the Tukey window, 0..=1.
     pub alpha: f64,
+    /// How the camera may move during a shaken frame.
+    pub model: Model,
+    /// Focal length in pixels; `None`: found or held at its default.
+    pub focal_px: Option<f64>,
+    /// Pixels (x, y) at which to look at the blur; empty: chosen.
+    pub patches: Vec<(usize, usize)>,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
     /// Interpolation of the warps; `None`: bilinear where a sharp frame holds the irradiance in place, bicubic where none does and
@@ -49,6 +55,9 @@ impl Default for Settings {
             exclude: Vec::new(),
             align: true,
             alpha: 0.3,
+            model: Model::Auto,
+            focal_px: None,
+            patches: Vec::new(),
             noise: None,
             interpolation: None,
             deblur: deblur::Settings::default(),
@@ -99,10 +108,8 @@ const FIRST_OUTER: usize = 2;
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
 const PATCH_SIZE: usize = 96;
-/// Largest translation of the pose grid, pixels.
-const GRID_RADIUS: usize = 16;
-/// Largest roll of the pose grid, degrees.
-const GRID_DEGREES: f64 = 2.0;
+/// Pixels around the path of a blur at a patch in which its PSF is looked for.
+const PSF_MARGIN: isize = 3;
 
 struct Run<'a> {
     gpu: Gpu,
@@ -181,6 +188,10 @@ fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
         && excluded[r]
     {
         return Err(Error::Input(format!("{}: is the reference frame and excluded; choose another reference", bracket.frames()[r].name)));
+    }
+    let (w, h) = bracket.size();
+    if let Some((x, y)) = settings.patches.iter().find(|p| p.0 >= w || p.1 >= h) {
+        return Err(Error::Input(format!("patch {x},{y} lies outside the frames, which are {w} x {h} pixels counted from 0,0")));
     }
     Ok(excluded)
 }
@@ -342,7 +353,11 @@ impl Run<'_> {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
             let (tsf, detail) = self.timed("blur", |run| Ok(run.estimate(i, &latent)))?;
             if tsf.is_none() {
-                self.leave_out(i, "no blur explains it against the sharp frames (too little structure that both see)")?;
+                self.leave_out(
+                    i,
+                    "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
+                     time, or more detail where this frame is not clipped, would help)",
+                )?;
             }
             tsfs[i] = tsf;
             details[i] = detail;
@@ -481,7 +496,7 @@ impl Run<'_> {
             data: (0..exposure.data.len())
                 .map(|p| {
                     let m = self.masks[i].data[p];
-                    // An operator is never true to better than a few per cent of the structure around a pixel.
+                    // An operator is never true to better than some per cent of the structure around a pixel.
                     let variance =
                         self.noise.variance(f64::from(exposure.data[p])) as f32 / 3.0 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
                     m * m / variance
@@ -492,30 +507,50 @@ impl Run<'_> {
         (exposure.map(|v| v / dt), weight)
     }
 
-    /// TSF of frame `i` against the sharp irradiance: patches, PSFs (11), TSF from the PSFs (6), whole frame.
+    /// TSF of frame `i` against the sharp irradiance, about where the frame lies; and, for people to look at, patches and their PSFs (11).
     fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
-        let (w, h) = latent.size();
         let base = self.base(i);
         let (seen, inside) = self.seen(latent, &base);
         let latent = latent.mean();
         let (blurred, weight) = self.luminance(i, &seen);
         let weight = weight.zip(&inside, |w, k| w * k);
-        let patches = psf::choose(&seen, &weight, PATCH_SIZE.min(w / 2).min(h / 2).max(16), PATCHES);
-        let psfs: Vec<(psf::Patch, psf::Psf)> =
-            patches.iter().filter_map(|p| Some((*p, psf::estimate(&seen, 0, &blurred, &weight, p, GRID_RADIUS)?))).collect();
-        let grid = PoseGrid::new(w, h, GRID_RADIUS, GRID_DEGREES, 1.0);
-        let from_psfs = tsf::from_psfs(&psfs, &grid, w, h);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
-        let tsf = frame.fit_grid(&grid, from_psfs.as_ref());
-        let tsf = tsf.map(|t| frame.refine(&t, self.settings.deblur.interpolation, 1));
+        let search = Search { model: self.settings.model, focal_px: self.settings.focal_px };
+        let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
+        let psfs = self.psfs(&seen, &blurred, &weight, &found.tsf);
         let detail = json!({
-            "patches": psfs.iter().map(|(p, h)| json!({
-                "x": p.x, "y": p.y, "size": p.size, "score": p.score,
-                "psf": { "radius": h.radius, "extent_px": h.extent(), "values": h.values.data },
+            "model": found.model,
+            "focal_px": found.tsf.focal_px,
+            "focal_length": found.focal,
+            "models_tried": found.trials,
+            "estimated_at_scale": found.scale,
+            "extent_px": tsf::extent(&found.tsf, latent.width, latent.height),
+            "residual": found.residual,
+            "patches": psfs.iter().map(|(p, m)| json!({
+                "x": p.x, "y": p.y, "size": p.size, "score": p.score, "confidence": m.confidence(), "expected_error": m.expected_error,
+                "psf": { "radius": m.psf.radius, "extent_px": m.psf.extent(), "values": m.psf.values.data },
             })).collect::<Vec<_>>(),
-            "tsf_from_psfs": from_psfs.map(|t| t.poses),
         });
-        (tsf, detail)
+        (Some(found.tsf), detail)
+    }
+
+    /// PSFs of chosen or given patches, looked for around where `tsf` passes.
+    fn psfs(&self, seen: &Plane, blurred: &Plane, weight: &Plane, tsf: &Tsf) -> Vec<(psf::Patch, psf::Measured)> {
+        let (w, h) = seen.size();
+        let reach = tsf::extent(tsf, w, h).ceil() as usize;
+        let size = PATCH_SIZE.max(3 * reach / 2).min(w / 2).min(h / 2).max(16);
+        let patches = if self.settings.patches.is_empty() {
+            psf::choose(seen, weight, size, PATCHES)
+        } else {
+            self.settings.patches.iter().map(|&(x, y)| psf::around(seen, weight, x, y, size)).collect()
+        };
+        let measure = |p: &psf::Patch| {
+            let path = tsf::path_at(tsf, p.centre(), (w, h));
+            let radius = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
+            let near = |x: isize, y: isize| path.iter().any(|u| (u.0 - x).abs() <= PSF_MARGIN && (u.1 - y).abs() <= PSF_MARGIN);
+            Some((*p, psf::estimate_within(seen, 0, blurred, weight, p, radius as usize, &near)?))
+        };
+        patches.iter().filter_map(measure).collect()
     }
 
     /// Luminance of the irradiance `latent` on the grid of a frame at `motion`, and 1 where it reaches.
@@ -535,7 +570,7 @@ impl Run<'_> {
         let (blurred, weight) = self.luminance(i, &seen);
         let weight = weight.zip(&inside, |w, k| w * k);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
-        tsf.map(|t| frame.refine(t, self.settings.deblur.interpolation, 1))
+        tsf.map(|t| frame.refine(t))
     }
 
     fn finish(
@@ -591,4 +626,4 @@ impl Run<'_> {
 /// Displacement in pixels of a blurred frame that the search for its poses covers by itself.
 const SEARCHED: f64 = 3.0;
 /// Standard deviation of the operator's own error, as a part of the mean absolute gradient around a pixel.
-const MODEL_ERROR: f32 = 0.05;
+const MODEL_ERROR: f32 = 0.03;

@@ -56,6 +56,16 @@ pub(super) struct MergeArgs {
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
     #[arg(long, value_name = "A", allow_hyphen_values = true)]
     pub alpha: Option<String>,
+    /// How the camera may move while a frame is exposed: auto, rigid (shift and roll), translation, rotation (pitch, yaw, roll)
+    /// or full (all five) [default: auto]
+    #[arg(long, value_name = "MODEL")]
+    pub model: Option<String>,
+    /// Focal length in pixels [default: from EXIF, else found or 1.2 times the longer side]
+    #[arg(long, value_name = "F", allow_hyphen_values = true)]
+    pub focal_px: Option<String>,
+    /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
+    #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
+    pub patch: Vec<String>,
     /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,

@@ -20,6 +20,11 @@ pub(super) fn names(paths: &[PathBuf]) -> Vec<String> {
         .collect()
 }
 
+/// Focal length in pixels from what the camera noted as its equivalent on 35 mm film (36 mm across), `None` if it did not.
+pub(super) fn focal_px(path: &Path, width: usize, height: usize) -> Result<Option<f64>, Error> {
+    Ok(metadata::focal_length_35mm(path)?.map(|f| f / 36.0 * width.max(height) as f64))
+}
+
 /// Checks of the list of frames that need no pixels.
 pub(super) fn check(paths: &[PathBuf]) -> anyhow::Result<()> {
     for (i, p) in paths.iter().enumerate() {

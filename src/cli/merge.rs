@@ -9,7 +9,7 @@ use crate::io::output::{self, Output};
 use crate::noise::NoiseModel;
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
-use crate::tsf::{Interpolation, TsfFile};
+use crate::tsf::{Interpolation, Model, TsfFile};
 use std::path::{Path, PathBuf};
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
@@ -41,6 +41,11 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         if args.frames.len() == settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
+        }
+        let mut settings = settings.clone();
+        if settings.focal_px.is_none() {
+            let (w, h) = bracket.size();
+            settings.focal_px = frames::focal_px(&args.frames[0], w, h)?;
         }
         let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
@@ -96,6 +101,19 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
             .ok()
             .filter(|a| (0.0..=1.0).contains(a))
             .ok_or_else(|| Usage(format!("--alpha: {word:?} is not a number from 0 to 1")))?;
+    }
+    if let Some(word) = &args.model {
+        let names: Vec<&str> = Model::ALL.iter().map(|m| m.name()).collect();
+        settings.model =
+            Model::named(word).ok_or_else(|| Usage(format!("--model: {word:?} is not a model; choose one of {}", names.join(", "))))?;
+    }
+    if let Some(word) = &args.focal_px {
+        let focal = word.parse().ok().filter(|f: &f64| f.is_finite() && *f > 0.0);
+        settings.focal_px = Some(focal.ok_or_else(|| Usage(format!("--focal-px: {word:?} is not a positive number of pixels")))?);
+    }
+    for word in &args.patch {
+        let pixel = word.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+        settings.patches.push(pixel.ok_or_else(|| Usage(format!("--patch: {word:?} is not a pixel such as 120,80")))?);
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
     settings.interpolation = args.interpolation.as_deref().map(|word| match word {

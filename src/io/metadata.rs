@@ -11,17 +11,30 @@ use std::path::Path;
 /// # Errors
 /// [`Error::Read`] when the file cannot be opened.
 pub fn exposure_time(path: &Path) -> Result<Option<f64>> {
+    let Some(exif) = read(path)? else { return Ok(None) };
+    Ok(number(&exif, Tag::ExposureTime).or_else(|| number(&exif, Tag::ShutterSpeedValue).map(|v| (-v).exp2())))
+}
+
+/// Focal length in mm that would give the same view on 35 mm film (FocalLengthIn35mmFilm); `None` when the file does not say, or says 0,
+/// which stands for unknown.
+///
+/// # Errors
+/// [`Error::Read`] when the file cannot be opened.
+pub fn focal_length_35mm(path: &Path) -> Result<Option<f64>> {
+    let Some(exif) = read(path)? else { return Ok(None) };
+    let value = exif.get_field(Tag::FocalLengthIn35mmFilm, In::PRIMARY).and_then(|f| f.value.get_uint(0));
+    Ok(value.filter(|v| *v > 0).map(f64::from))
+}
+
+/// The EXIF data of a file, if any can be read.
+fn read(path: &Path) -> Result<Option<Exif>> {
     let file = std::fs::File::open(path).map_err(|e| Error::Read { path: path.into(), reason: super::plain(&e) })?;
     let mut reader = exif::Reader::new();
     reader.continue_on_error(true);
-    let exif = match reader.read_from_container(&mut BufReader::new(file)) {
-        Ok(exif) => exif,
-        Err(e) => match e.distill_partial_result(|_| ()) {
-            Ok(exif) => exif,
-            Err(_) => return Ok(None),
-        },
-    };
-    Ok(number(&exif, Tag::ExposureTime).or_else(|| number(&exif, Tag::ShutterSpeedValue).map(|v| (-v).exp2())))
+    match reader.read_from_container(&mut BufReader::new(file)) {
+        Ok(exif) => Ok(Some(exif)),
+        Err(e) => Ok(e.distill_partial_result(|_| ()).ok()),
+    }
 }
 
 /// First value of a rational field; 0/0 counts as absent.

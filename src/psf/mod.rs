@@ -3,8 +3,8 @@
 mod paired;
 mod patch;
 
-pub use paired::estimate;
-pub use patch::{Patch, choose};
+pub use paired::{Measured, estimate, estimate_within};
+pub use patch::{Patch, around, choose};
 
 use crate::image::Plane;
 

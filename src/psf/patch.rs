@@ -37,18 +37,7 @@ pub fn choose(latent: &Plane, weight: &Plane, size: usize, count: usize) -> Vec<
     let mut candidates = Vec::new();
     for y in (0..=h - size).step_by(stride) {
         for x in (0..=w - size).step_by(stride) {
-            let (mut xx, mut yy, mut xy) = (0.0, 0.0, 0.0);
-            for j in y..y + size - 1 {
-                for i in x..x + size - 1 {
-                    let k = f64::from(weight.at(i, j).min(weight.at(i + 1, j)).min(weight.at(i, j + 1)));
-                    let gx = f64::from(latent.at(i + 1, j) - latent.at(i, j));
-                    let gy = f64::from(latent.at(i, j + 1) - latent.at(i, j));
-                    xx += k * gx * gx;
-                    yy += k * gy * gy;
-                    xy += k * gx * gy;
-                }
-            }
-            let score = 0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
+            let score = score(latent, weight, x, y, size);
             if score > 0.0 {
                 candidates.push(Patch { x, y, size, score });
             }
@@ -68,4 +57,28 @@ pub fn choose(latent: &Plane, weight: &Plane, size: usize, count: usize) -> Vec<
         chosen.push(best);
     }
     chosen
+}
+
+/// The patch of side `size` around the pixel (x, y), moved inside the frame.
+pub fn around(latent: &Plane, weight: &Plane, x: usize, y: usize, size: usize) -> Patch {
+    let (w, h) = latent.size();
+    let size = size.min(w).min(h);
+    let (x, y) = (x.saturating_sub(size / 2).min(w - size), y.saturating_sub(size / 2).min(h - size));
+    Patch { x, y, size, score: score(latent, weight, x, y, size) }
+}
+
+/// Smaller eigenvalue of the noise-weighted structure tensor of a square.
+fn score(latent: &Plane, weight: &Plane, x: usize, y: usize, size: usize) -> f64 {
+    let (mut xx, mut yy, mut xy) = (0.0, 0.0, 0.0);
+    for j in y..y + size - 1 {
+        for i in x..x + size - 1 {
+            let k = f64::from(weight.at(i, j).min(weight.at(i + 1, j)).min(weight.at(i, j + 1)));
+            let gx = f64::from(latent.at(i + 1, j) - latent.at(i, j));
+            let gy = f64::from(latent.at(i, j + 1) - latent.at(i, j));
+            xx += k * gx * gx;
+            yy += k * gy * gy;
+            xy += k * gx * gy;
+        }
+    }
+    0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt()
 }

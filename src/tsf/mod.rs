@@ -1,11 +1,16 @@
 //! Transformation spread functions (section II-B): which poses the camera went through and for how long.
 
 mod active_set;
+mod continuous;
+mod estimate;
 mod from_psfs;
+mod model;
 mod taps;
 mod whole_frame;
 
+pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
+pub use model::Model;
 pub use taps::{Interpolation, Tap, TapSet};
 pub use whole_frame::WholeFrame;
 

@@ -13,8 +13,8 @@ use std::collections::BTreeMap;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Interpolation {
-    /// Two taps per axis: the default. With poses refined under the same interpolation it measures as well as the longer kernels (39.5 dB
-    /// against 39.1 dB for bicubic on a 226 x 341 bracket) at half the time.
+    /// Two taps per axis: the default, at half the time of the longer kernels. It is itself a blur: with the true poses the operator is off by
+    /// 1.5 to 3.7 % of the blurred image, but the solver's result is as good (36.3 dB against 36.1 dB for bicubic on a 226 x 341 bracket).
     #[default]
     Bilinear,
     /// Four taps per axis: cubic convolution (Keys 1981, a = -1/2).

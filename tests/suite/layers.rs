@@ -70,6 +70,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "tonemap",
             "synth",
             "gpu::list_adapters",
+            "tsf::Model",
             "tsf::Tsf",
             "tsf::TsfEntry",
             "tsf::TsfFile",

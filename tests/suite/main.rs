@@ -36,3 +36,5 @@ mod stages;
 mod synth;
 /// Tone mapping: degenerate images, shadows and highlights together, no halos.
 mod tonemap;
+/// TSFs from whole frames: models, extents, focal lengths.
+mod tsf;

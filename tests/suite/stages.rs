@@ -1,6 +1,7 @@
 //! The estimators, each on input whose answer is planted.
 
 use crate::support::noise as numbers;
+use crate::support::texture;
 use glam::DMat3;
 use unshaken::exposure::Frame;
 use unshaken::image::{Plane, Rgb};
@@ -11,54 +12,9 @@ use unshaken::psf::{self, Patch, Psf};
 use unshaken::response::Response;
 use unshaken::synth::{self, Camera, Tremor};
 use unshaken::triage;
-use unshaken::tsf::{self, Interpolation, TapSet, Tsf, WholeFrame};
+use unshaken::tsf::{self, Tsf};
 
 const SIZE: (usize, usize) = (128, 96);
-
-/// Texture that determines a blur: smoothed noise over a few scales, positive.
-fn texture(width: usize, height: usize) -> Plane {
-    let n = numbers(7, width * height);
-    let fine = Plane { width, height, data: n };
-    let at = |x: usize, y: usize, r: isize| {
-        let mut sum = 0.0;
-        for j in -r..=r {
-            for i in -r..=r {
-                sum += fine.clamped(x as isize + i, y as isize + j);
-            }
-        }
-        sum / (2 * r + 1) as f32
-    };
-    Plane::from_fn(width, height, |x, y| 2.0 + 0.5 * at(x, y, 1) + 0.5 * at(x, y, 3))
-}
-
-/// The frame that `tsf` makes of `latent` (which surrounds it by `pad`), by direct summation over poses, bilinear.
-fn blur(latent: &Plane, pad: usize, tsf: &Tsf, size: (usize, usize)) -> Plane {
-    let centre = glam::DVec2::new((size.0 as f64 - 1.0) / 2.0, (size.1 as f64 - 1.0) / 2.0);
-    let mut out = Plane::filled(size.0, size.1, 0.0);
-    for pose in &tsf.poses {
-        let inverse = pose.homography(tsf.focal_px).inverse();
-        for y in 0..size.1 {
-            for x in 0..size.0 {
-                let p = unshaken::pose::project(&inverse, glam::DVec2::new(x as f64, y as f64) - centre) + centre + pad as f64;
-                let (i, j) = (p.x.floor(), p.y.floor());
-                let (u, v) = ((p.x - i) as f32, (p.y - j) as f32);
-                let at = |a: isize, b: isize| latent.clamped(i as isize + a, j as isize + b);
-                let value = (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1));
-                out.data[y * size.0 + x] += pose.weight as f32 * value;
-            }
-        }
-    }
-    out
-}
-
-/// Root mean square difference of two blurs of the same scene over that of the blur and the scene, away from the border.
-fn operator_error(latent: &Plane, pad: usize, a: &Tsf, b: &Tsf, size: (usize, usize)) -> f64 {
-    let (p, q, e) = (blur(latent, pad, a, size), blur(latent, pad, b, size), blur(latent, pad, &Tsf::identity(), size));
-    let inner = |f: &dyn Fn(usize) -> f64| -> f64 {
-        (8..size.1 - 8).flat_map(|y| (8..size.0 - 8).map(move |x| y * size.0 + x)).map(f).sum::<f64>().sqrt()
-    };
-    inner(&|i| f64::from(p.data[i] - q.data[i]).powi(2)) / inner(&|i| f64::from(p.data[i] - e.data[i]).powi(2))
-}
 
 fn planted(poses: &[(f64, f64, f64, f64)]) -> Tsf {
     Tsf::new(1.2 * SIZE.0 as f64, poses.iter().map(|p| Pose::planar(p.0, p.1, p.2, p.3)).collect()).unwrap()
@@ -195,31 +151,6 @@ fn the_tsf_of_exact_psfs_is_the_planted_one() {
             .map(|p| p.weight)
             .sum();
         assert!((weight - want.weight).abs() < 0.08, "{want:?} has weight {weight:.3}");
-    }
-}
-
-#[test]
-fn the_whole_frame_gives_the_tsf_on_the_grid_and_between() {
-    let pad = 12;
-    let latent = texture(SIZE.0 + 2 * pad, SIZE.1 + 2 * pad);
-    let grid = PoseGrid::new(SIZE.0, SIZE.1, 8, 1.5, 1.0);
-    let weight = Plane::filled(SIZE.0, SIZE.1, 1e5);
-    for (name, truth, limit) in [
-        ("on the grid", planted(&[(0.0, 0.0, 0.0, 0.5), (2.0, 1.0, 0.0, 0.3), (5.0, -2.0, 0.0, 0.2)]), 3e-4),
-        ("between", planted(&[(0.3, -0.4, 0.1, 0.3), (1.4, 0.7, 0.3, 0.3), (2.6, 1.5, 0.55, 0.2), (3.5, 2.4, 0.8, 0.2)]), 0.05),
-    ] {
-        let blurred = blur(&latent, pad, &truth, SIZE);
-        let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
-        let coarse = frame.fit_grid(&grid, None).expect("something fits");
-        let fine = frame.refine(&coarse, Interpolation::Bilinear, 2);
-        let (a, b) = (operator_error(&latent, pad, &coarse, &truth, SIZE), operator_error(&latent, pad, &fine, &truth, SIZE));
-        assert!(b < limit, "{name}: operator error {a:.4} on the grid, {b:.4} refined");
-        assert!((fine.poses.iter().map(|p| p.weight).sum::<f64>() - 1.0).abs() < 1e-9);
-        let (m, t) = (fine.mean(), truth.mean());
-        assert!((m.t_x - t.t_x).abs() < 0.1 && (m.t_y - t.t_y).abs() < 0.1 && (m.theta_z_deg - t.theta_z_deg).abs() < 0.1, "{name}: {m:?}");
-        // Whatever the poses, the taps keep the brightness.
-        let taps = TapSet::new(&fine, SIZE.0, SIZE.1, Interpolation::Bilinear);
-        assert!((taps.taps.iter().map(|t| t.weight).sum::<f64>() - 1.0).abs() < 1e-9);
     }
 }
 

@@ -3,6 +3,8 @@
 pub mod files;
 pub mod gpu;
 
+use unshaken::image::Plane;
+
 /// Numbers of -1..1 from a fixed seed (splitmix64).
 pub fn noise(seed: u64, count: usize) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0x1234_5678;
@@ -42,4 +44,20 @@ pub fn assert_close(what: &str, got: &[f32], expected: &[f64], tolerance: impl F
             tolerance(i)
         );
     }
+}
+
+/// Texture that determines a blur: smoothed noise over a few scales, positive.
+pub fn texture(width: usize, height: usize) -> Plane {
+    let n = noise(7, width * height);
+    let fine = Plane { width, height, data: n };
+    let at = |x: usize, y: usize, r: isize| {
+        let mut sum = 0.0;
+        for j in -r..=r {
+            for i in -r..=r {
+                sum += fine.clamped(x as isize + i, y as isize + j);
+            }
+        }
+        sum / (2 * r + 1) as f32
+    };
+    Plane::from_fn(width, height, |x, y| 2.0 + 0.5 * at(x, y, 1) + 0.5 * at(x, y, 3))
 }

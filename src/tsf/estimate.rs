@@ -1,0 +1,455 @@
+//! TSF of a frame from nothing: coarse-to-fine over a pyramid, then the motion model that the frame asks for.
+//!
+//! At the coarsest level any blur is a few pixels, and a grid of poses is searched whole. Each finer level looks only around the poses of
+//! the level before: first which poses of a lattice of one pixel (eq. 6, against the frame itself), then their continuous positions.
+
+use super::Tsf;
+use super::continuous::Evidence;
+use super::from_psfs::nominal_focal;
+use super::model::{Chart, Coordinates, Model};
+use super::whole_frame::{Row, WholeFrame};
+use crate::image::Plane;
+use crate::pose::{Pose, PoseGrid, project};
+use glam::{DMat3, DVec3};
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// What is asked of [`WholeFrame::estimate`].
+#[derive(Clone, Debug, Default)]
+pub struct Search {
+    /// How the camera may move.
+    pub model: Model,
+    /// Focal length in pixels; `None`: found where pitch and yaw show it, else 1.2 times the longer side.
+    pub focal_px: Option<f64>,
+}
+
+/// A model that was tried.
+#[derive(Clone, Debug, Serialize)]
+pub struct Trial {
+    /// The model.
+    pub model: Model,
+    /// Focal length in pixels under which it was tried.
+    pub focal_px: f64,
+    /// Mean squared residual over variance (noise and expected operator error) of the differences that it was not fitted to.
+    pub held_out: f64,
+    /// How much worse than the best trial: mean logarithm of the ratio of squared residuals over blocks of the frame.
+    pub worse_by: f64,
+}
+
+/// What was found about one frame.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// The TSF.
+    pub tsf: Tsf,
+    /// The model it lies in.
+    pub model: Model,
+    /// Whether the focal length was given, found or held at its default: `given`, `found`, `default`.
+    pub focal: &'static str,
+    /// The models that were tried against held-out differences; empty where the model was given.
+    pub trials: Vec<Trial>,
+    /// Frame pixels per pixel of the finest level that the blur needed: 1, 2, 4, ...
+    pub scale: usize,
+    /// Mean squared residual over variance of the differences that count.
+    pub residual: f64,
+    /// By how much the TSF lowers the squared residual, in units of the noise, per number that it has: about 1 where it explains noise alone.
+    pub evidence: f64,
+}
+
+impl Estimate {
+    /// Whether the frame has enough texture, seen well enough, to tell its blur.
+    pub fn is_sound(&self) -> bool {
+        self.evidence > EVIDENCE
+    }
+}
+
+/// Least [`Estimate::evidence`] of a TSF that says something: noise alone reaches 1 to 2.
+const EVIDENCE: f64 = 6.0;
+
+/// Differences that the continuous poses are fitted to.
+const ROWS: usize = 14_000;
+/// Shorter side in pixels below which a level holds too little to see.
+const SMALLEST: usize = 56;
+/// Largest translation of the coarsest grid in its pixels.
+const RADIUS: usize = 16;
+/// Largest roll searched, degrees.
+const DEGREES: f64 = 2.5;
+/// Extent of the blur in pixels beyond which a coarser level tells all that can be told.
+const FINEST_EXTENT: f64 = 48.0;
+/// Sides of the blocks that are held out, as a part of the longer side.
+const BLOCKS: usize = 14;
+/// Focal lengths tried, times the longer side: from a wide lens to a short telephoto lens.
+const FOCALS: [f64; 4] = [0.6, 0.85, 1.7, 2.4];
+/// Iterations of a trial: the start is near.
+const TRIAL: usize = 4;
+
+/// A level of the pyramid.
+struct Level {
+    latent: Plane,
+    pad: usize,
+    blurred: Plane,
+    weight: Plane,
+    base: DMat3,
+}
+
+impl Level {
+    fn frame(&self) -> WholeFrame<'_> {
+        WholeFrame { latent: &self.latent, pad: self.pad, blurred: &self.blurred, weight: &self.weight, base: self.base }
+    }
+
+    /// Half the size.
+    fn half(frame: &WholeFrame) -> Self {
+        // An odd pad would put the frame between the pixels of the halved latent image.
+        let cut = frame.pad % 2;
+        let cropped = (cut > 0).then(|| frame.latent.crop(cut, cut, frame.latent.width - 2 * cut, frame.latent.height - 2 * cut));
+        let s = DMat3::from_diagonal(DVec3::new(0.5, 0.5, 1.0));
+        let variance = frame.weight.map(|w| if w > 0.0 { 1.0 / w } else { f32::INFINITY });
+        Self {
+            latent: halve(cropped.as_ref().unwrap_or(frame.latent)),
+            pad: frame.pad / 2,
+            blurred: halve(frame.blurred),
+            // Squared weights of the filter sum to (20/64)² instead of 1: white noise falls, a masked pixel masks all it touches.
+            weight: halve(&variance).map(|v| if v.is_finite() { 1.0 / (v * (20.0f32 / 64.0).powi(2)) } else { 0.0 }),
+            base: s * frame.base * s.inverse(),
+        }
+    }
+}
+
+/// Half the size through the binomial filter [1 3 3 1]/8, which passes little that the coarser grid cannot hold.
+fn halve(p: &Plane) -> Plane {
+    let (w, h) = (p.width / 2, p.height / 2);
+    let f = [0.125f32, 0.375, 0.375, 0.125];
+    let rows = Plane::from_fn(w, p.height, |x, y| (0..4).map(|k| f[k] * p.clamped(2 * x as isize + k as isize - 1, y as isize)).sum());
+    Plane::from_fn(w, h, |x, y| (0..4).map(|k| f[k] * rows.clamped(x as isize, 2 * y as isize + k as isize - 1)).sum())
+}
+
+fn scaled(tsf: &Tsf, factor: f64) -> Tsf {
+    let poses = tsf.poses.iter().map(|p| Pose { t_x: p.t_x * factor, t_y: p.t_y * factor, ..*p }).collect();
+    Tsf { focal_px: tsf.focal_px * factor, poses, base: DMat3::IDENTITY }
+}
+
+/// Extent in pixels, the largest over corners and centre, of what the TSF does to a point: all but the outermost hundredth of its time on
+/// either side, since a stray pose of next to no weight is not blur.
+pub fn extent(tsf: &Tsf, width: usize, height: usize) -> f64 {
+    let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let span = |mut along: Vec<(f64, f64)>| {
+        along.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut before = 0.0;
+        let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
+        for (v, w) in along {
+            if before + w > 0.01 && before < 0.99 {
+                (lo, hi) = (lo.min(v), hi.max(v));
+            }
+            before += w;
+        }
+        (hi - lo).max(0.0)
+    };
+    let mut worst = 0.0f64;
+    for (i, j) in [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+        let p = glam::DVec2::new(i * x, j * y);
+        let moved: Vec<(glam::DVec2, f64)> = tsf.poses.iter().map(|pose| (pose.apply(tsf.focal_px, p), pose.weight)).collect();
+        worst = worst.max(span(moved.iter().map(|m| (m.0.x, m.1)).collect())).max(span(moved.iter().map(|m| (m.0.y, m.1)).collect()));
+    }
+    worst
+}
+
+/// Whole pixels u = p - Γ⁻¹ p near which the PSF at the frame's pixel `p` of a `size` frame has its values.
+pub fn path_at(tsf: &Tsf, p: (f64, f64), size: (usize, usize)) -> Vec<(isize, isize)> {
+    let p = glam::DVec2::new(p.0 - (size.0 as f64 - 1.0) / 2.0, p.1 - (size.1 as f64 - 1.0) / 2.0);
+    let mut path: Vec<(isize, isize)> = tsf
+        .poses
+        .iter()
+        .map(|pose| {
+            let u = p - project(&pose.homography(tsf.focal_px).inverse(), p);
+            (u.x.round() as isize, u.y.round() as isize)
+        })
+        .collect();
+    path.sort_unstable();
+    path.dedup();
+    path
+}
+
+/// Farthest that any pose takes a corner or the centre, pixels.
+fn reach(tsf: &Tsf, size: (usize, usize)) -> f64 {
+    let (x, y) = (0.5 * (size.0 as f64 - 1.0), 0.5 * (size.1 as f64 - 1.0));
+    let mut worst = 0.0f64;
+    for pose in &tsf.poses {
+        for (i, j) in [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+            let p = glam::DVec2::new(i * x, j * y);
+            worst = worst.max((pose.apply(tsf.focal_px, p) - p).abs().max_element());
+        }
+    }
+    worst
+}
+
+/// Particles that stand for one continuous pose together: the heaviest take in those within `radius` pixels.
+pub(super) fn gather(particles: &mut Vec<(Coordinates, f64)>, radius: f64, most: usize) {
+    particles.sort_by(|a, b| b.1.total_cmp(&a.1));
+    // (coordinates, weight, where it was when it took its place)
+    let mut out: Vec<(Coordinates, f64, Coordinates)> = Vec::new();
+    for (c, w) in particles.iter() {
+        let distance = |home: &Coordinates| home.iter().zip(c).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        let near = out.iter_mut().map(|q| (distance(&q.2), q)).min_by(|a, b| a.0.total_cmp(&b.0));
+        match near {
+            Some((d, q)) if d <= radius => {
+                let s = q.1 + w;
+                for (a, b) in q.0.iter_mut().zip(c) {
+                    *a = (*a * q.1 + b * w) / s;
+                }
+                q.1 = s;
+            }
+            _ => out.push((*c, *w, *c)),
+        }
+    }
+    let total: f64 = out.iter().map(|p| p.1).sum();
+    out.sort_by(|a, b| b.1.total_cmp(&a.1));
+    out.retain(|p| p.1 > 1e-3 * total);
+    out.truncate(most);
+    *particles = out.into_iter().map(|(c, w, _)| (c, w)).collect();
+}
+
+/// The lattice poses within a step of those of `tsf`.
+fn around(tsf: &Tsf, chart: &Chart, step: f64) -> Vec<Pose> {
+    let mut seen: BTreeMap<[i64; 3], Coordinates> = BTreeMap::new();
+    let roll = if chart.free() > 2 { 1 } else { 0 };
+    for pose in &tsf.poses {
+        let c = chart.coordinates(pose);
+        let at: [i64; 3] = std::array::from_fn(|k| (c[k] / step).round() as i64);
+        for dz in -roll..=roll {
+            for dy in -1..=1 {
+                for dx in -1..=1 {
+                    let key = [at[0] + dx, at[1] + dy, at[2] + dz];
+                    seen.entry(key).or_insert([key[0] as f64 * step, key[1] as f64 * step, key[2] as f64 * step, c[3], c[4]]);
+                }
+            }
+        }
+    }
+    seen.values().map(|c| chart.pose(c, 1.0)).collect()
+}
+
+/// Continuous poses for the lattice poses of `tsf`: as close together as their number allows.
+fn gathered(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
+    let mut particles = Vec::new();
+    for radius in GATHER {
+        particles = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
+        gather(&mut particles, radius, MOST);
+        if particles.len() <= FEW {
+            break;
+        }
+    }
+    Tsf::new(chart.focal, particles.iter().map(|(c, w)| chart.pose(c, *w)).collect()).ok()
+}
+
+/// Distances in pixels within which lattice poses become one continuous pose: the first that leaves few, else the last.
+const GATHER: [f64; 3] = [0.7, 0.9, 1.2];
+/// So few continuous poses are refined in no time.
+const FEW: usize = 50;
+/// Continuous poses at most.
+const MOST: usize = 250;
+
+impl WholeFrame<'_> {
+    /// TSF of this frame from nothing; `None` when no pose explains it better than none.
+    pub fn estimate(&self, search: &Search) -> Option<Estimate> {
+        let (w, h) = self.size();
+        let mut count = 0;
+        while w.min(h) >> (count + 1) >= SMALLEST {
+            count += 1;
+        }
+        let levels = self.levels(count);
+        let level = |l: usize| if l == 0 { WholeFrame { ..*self } } else { levels[l - 1].frame() };
+
+        let focal = search.focal_px.unwrap_or_else(|| nominal_focal(w, h));
+        let coarse = level(count);
+        let (cw, ch) = coarse.size();
+        let grid = PoseGrid::new(cw, ch, RADIUS.min(cw.min(ch) / 5), DEGREES, 1.0);
+        let mut tsf = scaled(&coarse.fit_grid(&grid, None)?, (1 << count) as f64);
+        tsf.focal_px = focal;
+        // Pitch and yaw show only at the finest level.
+        let planar = if search.model == Model::Translation { Model::Translation } else { Model::Rigid };
+        let mut l = count;
+        loop {
+            let scale = (1 << l) as f64;
+            let frame = level(l);
+            let (fw, fh) = frame.size();
+            let chart = Chart::new(planar, focal / scale, fw, fh);
+            let mut here = scaled(&tsf, 1.0 / scale);
+            let margin = margin(&here, (fw, fh));
+            if l < count {
+                let rows = frame.rows(ROWS / 2, margin);
+                here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal)?;
+            }
+            here = gathered(&here, &chart)?;
+            let rows = frame.rows(ROWS, margin);
+            here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
+            tsf = scaled(&here, scale);
+            if l == 0 || extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
+                break;
+            }
+            l -= 1;
+        }
+        let found = choose(&level(l), l, &tsf, focal, search);
+        Some(Estimate { tsf: found.tsf.about(self.base), ..found })
+    }
+
+    /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model.
+    pub fn refine(&self, tsf: &Tsf) -> Tsf {
+        let (w, h) = self.size();
+        let mut l = 0;
+        while extent(tsf, w, h) > FINEST_EXTENT * f64::from(1 << l) && w.min(h) >> (l + 1) >= SMALLEST {
+            l += 1;
+        }
+        let levels = self.levels(l);
+        let frame = if l == 0 { WholeFrame { ..*self } } else { levels[l - 1].frame() };
+        let scale = f64::from(1 << l);
+        let size = frame.size();
+        let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
+        let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart) else { return tsf.clone() };
+        let rows = frame.rows(ROWS, margin(&start, size));
+        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale).about(self.base)
+    }
+
+    /// The coarser levels of the pyramid: 1/2, 1/4, ...
+    fn levels(&self, count: usize) -> Vec<Level> {
+        let mut levels: Vec<Level> = Vec::new();
+        for _ in 0..count {
+            let next = Level::half(&levels.last().map_or(WholeFrame { ..*self }, Level::frame));
+            levels.push(next);
+        }
+        levels
+    }
+}
+
+/// The model of the TSF, and the TSF within it, from the planar `tsf` at level `l`.
+fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) -> Estimate {
+    let scale = (1 << l) as f64;
+    let (w, h) = frame.size();
+    let start = scaled(tsf, 1.0 / scale);
+    let all = frame.rows(ROWS, margin(&start, (w, h)));
+    let fit = |rows: &[Row], model: Model, focal: f64, from: &Tsf, iterations: usize| {
+        Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
+    };
+    let block = w.max(h).div_ceil(BLOCKS);
+    let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13) % 5 == 0;
+    let mut trials = Vec::new();
+    let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
+    if search.model == Model::Auto {
+        let (outside, inside): (Vec<Row>, Vec<Row>) = all.iter().partition(|r| held(r));
+        let judge = Evidence::new(frame, &outside);
+        let mut tried: Vec<(Model, f64, Vec<(usize, f64)>)> = Vec::new();
+        let mut attempt = |model: Model, focal: f64| {
+            let t = fit(&inside, model, focal, &start, TRIAL);
+            let r = judge.residual(&t);
+            let blocks = outside.iter().zip(&r).map(|(o, v)| (o.y as usize / block * 1000 + o.x as usize / block, f64::from(*v).powi(2)));
+            let blocks: Vec<(usize, f64)> = blocks.collect();
+            tried.push((model, focal, blocks.clone()));
+            blocks
+        };
+        attempt(Model::Translation, focal);
+        let rigid = attempt(Model::Rigid, focal);
+        let turned = attempt(Model::Rotation, focal);
+        let full = attempt(Model::Full, focal);
+        // Other focal lengths only where perspective shows at all: otherwise none can be told from another.
+        let seen = !Worse::than(&rigid, &turned).forgivable() || !Worse::than(&rigid, &full).forgivable();
+        if search.focal_px.is_none() && seen {
+            for f in FOCALS {
+                attempt(Model::Rotation, f * w.max(h) as f64 * scale);
+            }
+        }
+        let mean = |t: &[(usize, f64)]| t.iter().map(|v| v.1).sum::<f64>() / t.len().max(1) as f64;
+        let better = |a: &[(usize, f64)], b: &[(usize, f64)]| Worse::than(a, b).by.total_cmp(&0.0);
+        let best = tried.iter().min_by(|a, b| better(&a.2, &b.2)).expect("several models are tried").clone();
+        let mut forgiven: Vec<(Model, f64)> = Vec::new();
+        for (m, f, r) in &tried {
+            let worse = Worse::than(r, &best.2);
+            trials.push(Trial { model: *m, focal_px: *f, held_out: mean(r), worse_by: worse.by });
+            if worse.forgivable() {
+                forgiven.push((*m, *f));
+            }
+        }
+        // The simplest that is not clearly worse; among focal lengths the default, unless another is clearly better.
+        let order = [Model::Translation, Model::Rigid, Model::Rotation, Model::Full];
+        model = order.into_iter().find(|m| forgiven.iter().any(|t| t.0 == *m)).unwrap_or(best.0);
+        if model == Model::Rotation && !forgiven.contains(&(Model::Rotation, focal)) {
+            let rotations = trials.iter().filter(|t| t.model == Model::Rotation);
+            chosen_focal = rotations.min_by(|a, b| a.worse_by.total_cmp(&b.worse_by)).map_or(focal, |t| t.focal_px);
+            source = "found";
+        }
+    }
+    let here = fit(&all, model, chosen_focal, &start, 10);
+    let evidence = Evidence::new(frame, &all);
+    let energy = |r: &[f32]| r.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+    let left = energy(&evidence.residual(&here));
+    let residual = left / all.len().max(1) as f64;
+    let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
+    let evidence = (energy(evidence.targets()) - left) / numbers as f64;
+    Estimate { tsf: filled(&here, scale), model, focal: source, trials, scale: 1 << l, residual, evidence }
+}
+
+/// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.
+fn filled(tsf: &Tsf, factor: f64) -> Tsf {
+    let mut out = scaled(tsf, factor);
+    let n = factor as i32;
+    if n > 1 {
+        let tent = |k: i32| f64::from(n - k.abs()) / f64::from(n * n);
+        let spread = |p: &Pose| {
+            let p = *p;
+            (1 - n..n).flat_map(move |j| {
+                (1 - n..n).map(move |i| Pose {
+                    t_x: p.t_x + f64::from(i),
+                    t_y: p.t_y + f64::from(j),
+                    weight: p.weight * tent(i) * tent(j),
+                    ..p
+                })
+            })
+        };
+        out.poses = out.poses.iter().flat_map(spread).collect();
+    }
+    out
+}
+
+/// The narrowest model that holds all poses of `tsf`.
+fn model_of(tsf: &Tsf) -> Model {
+    let any = |f: fn(&Pose) -> f64| tsf.poses.iter().any(|p| f(p).abs() > 1e-9);
+    match (any(|p| p.theta_x_deg) || any(|p| p.theta_y_deg), any(|p| p.t_x) || any(|p| p.t_y)) {
+        (true, true) => Model::Full,
+        (true, false) => Model::Rotation,
+        (false, _) if any(|p| p.theta_z_deg) => Model::Rigid,
+        (false, _) => Model::Translation,
+    }
+}
+
+/// How much worse a model explains held-out differences than another: the mean over blocks of the logarithm of the ratio of their squared
+/// residuals (a sum over the frame would speak of its brightest edges alone), and that in standard errors.
+#[derive(Clone, Copy)]
+struct Worse {
+    by: f64,
+    errors: f64,
+}
+
+impl Worse {
+    fn than(a: &[(usize, f64)], b: &[(usize, f64)]) -> Self {
+        let mut blocks: BTreeMap<usize, (f64, f64, f64)> = BTreeMap::new();
+        for (x, y) in a.iter().zip(b) {
+            let block = blocks.entry(x.0).or_default();
+            *block = (block.0 + x.1, block.1 + y.1, block.2 + 1.0);
+        }
+        // A tenth of the noise: blocks that are explained better than that say nothing more.
+        let ratios: Vec<f64> = blocks.values().filter(|b| b.2 >= 8.0).map(|b| ((b.0 + 0.1 * b.2) / (b.1 + 0.1 * b.2)).ln()).collect();
+        let n = ratios.len() as f64;
+        if n < 2.0 {
+            return Self { by: 0.0, errors: 0.0 };
+        }
+        let mean = ratios.iter().sum::<f64>() / n;
+        let variance = ratios.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0);
+        Self { by: mean, errors: if variance > 0.0 { mean / (variance / n).sqrt() } else { 0.0 } }
+    }
+
+    /// Whether the simpler model may be taken all the same: less than a per cent is nothing, up to 8 % if it may be chance.
+    fn forgivable(self) -> bool {
+        self.by < 0.01 || self.by < 0.08 && self.errors < 2.0
+    }
+}
+
+/// Pixels from the border within which a pose looks beyond the frame, at most a fifth of the shorter side.
+fn margin(tsf: &Tsf, size: (usize, usize)) -> usize {
+    (reach(tsf, size).ceil() as usize + 3).min(size.0.min(size.1) / 5)
+}
