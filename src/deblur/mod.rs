@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget,
+    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, ScratchSize, WeightTarget,
     channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
@@ -294,10 +294,11 @@ impl<'a> Solver<'a> {
             })
             .collect();
         let any_moving = blurs.iter().any(Option::is_some);
-        let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).max().unwrap_or(0);
-        let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).max().unwrap_or(0);
+        let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).fold(ScratchSize::default(), ScratchSize::max);
+        let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).fold(ScratchSize::default(), ScratchSize::max);
         // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let scratch = Scratch::new(gpu, wanted.min((1 << 25).min(gpu.max_plane()).max(needed)))?;
+        let most = (1 << 25).min(gpu.max_binding());
+        let scratch = Scratch::new(gpu, wanted.min(ScratchSize { planes: most, copy: most }.max(needed)))?;
         let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
         let ch = |label, count| channels(gpu, label, count);
         let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));

@@ -54,11 +54,17 @@ impl Kernel {
 
     /// A dispatch of `groups` workgroups with these parameters and buffers.
     pub fn step<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], groups: [u32; 3]) -> Step {
+        let parts: Vec<_> = buffers.iter().map(|b| b.as_entire_buffer_binding()).collect();
+        self.step_parts(gpu, params, &parts, groups)
+    }
+
+    /// [`Kernel::step`] that sees only parts of its buffers.
+    pub fn step_parts<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, parts: &[wgpu::BufferBinding], groups: [u32; 3]) -> Step {
         let uniform = gpu.uniform(self.label, bytemuck::bytes_of(params));
-        let entries: Vec<_> = std::iter::once(&uniform)
-            .chain(buffers.iter().copied())
+        let entries: Vec<_> = std::iter::once(uniform.as_entire_buffer_binding())
+            .chain(parts.iter().cloned())
             .enumerate()
-            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: b.as_entire_binding() })
+            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: wgpu::BindingResource::Buffer(b) })
             .collect();
         let bindings =
             gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries });
