@@ -119,9 +119,8 @@ impl RotateShift {
                     }
                     for (out, rotated) in out.iter_mut().zip(&*rotated) {
                         for (j, target) in out.chunks_exact_mut(w).enumerate() {
-                            let sources = |t: &(i32, i32, f32)| {
-                                (&rotated[(j as i32 + r - t.1) as usize * wide + (r - t.0) as usize..][..w], t.2)
-                            };
+                            let sources =
+                                |t: &(i32, i32, f32)| (&rotated[(j as i32 + r - t.1) as usize * wide + (r - t.0) as usize..][..w], t.2);
                             sum_rows(&angle.taps, sources, target);
                         }
                     }

@@ -212,7 +212,11 @@ impl Scratch {
     /// # Errors
     /// As [`Gpu::plane`].
     pub fn new(gpu: &Gpu, size: ScratchSize) -> Result<Self> {
-        Ok(Self { planes: super::channels(gpu, "base warps", size.planes)?, copy: super::channels(gpu, "copy with margin", size.copy)?, size })
+        Ok(Self {
+            planes: super::channels(gpu, "base warps", size.planes)?,
+            copy: super::channels(gpu, "copy with margin", size.copy)?,
+            size,
+        })
     }
 }
 
@@ -230,8 +234,9 @@ pub struct Blur {
     taps: usize,
     near: bool,
     reach: i32,
+    direct: bool,
     base_table: wgpu::Buffer,
-    /// Empty: the direct design.
+    /// None in the direct design.
     chunks: Vec<Chunk>,
 }
 
@@ -250,8 +255,6 @@ const GROUP_TAPS: usize = 3000;
 const MARGIN: usize = 8;
 /// Zero columns on either side of the adjoint's planes: at least the window of shaders/warp_adjoint_near.wgsl.
 const SIDE: usize = 12;
-/// What a pixel of a base warp costs, in taps (lavapipe: 13 ns against 2.4 ns).
-const WARP_COST: usize = 6;
 
 /// Shifts (dy, dx, weight) of one base warp, sorted.
 type Group = Vec<(i32, i32, f64)>;
@@ -299,6 +302,7 @@ impl Blur {
             taps: taps.taps.len(),
             near,
             reach,
+            direct,
             base_table: gpu.table::<BaseTable>("base warps", &[]),
             chunks: Vec::new(),
         };
@@ -360,10 +364,6 @@ impl Blur {
         out
     }
 
-    fn direct(&self) -> bool {
-        self.chunks.is_empty()
-    }
-
     /// Columns and rows by which the shifts widen a plane.
     fn shifts(&self) -> (usize, usize) {
         ((self.shift_x.1 - self.shift_x.0) as usize, (self.shift_y.1 - self.shift_y.0) as usize)
@@ -376,7 +376,7 @@ impl Blur {
 
     /// Values per row of the copy that the adjoint reads.
     fn copy_width(&self) -> usize {
-        if self.direct() { self.frame.0 + 2 * SIDE } else { self.width(true) + self.shifts().0 + 8 }
+        if self.direct { self.frame.0 + 2 * SIDE } else { self.width(true) + self.shifts().0 + 8 }
     }
 
     /// Rows of scratch in all: what the shifts make of the frame.
@@ -422,7 +422,7 @@ impl Blur {
     fn scratch_for(&self, cut: Cut) -> ScratchSize {
         let shifts = self.shifts().1;
         let copy = self.forward_copy(cut.rows).max((cut.rows + shifts) * self.copy_width());
-        if self.direct() {
+        if self.direct {
             return ScratchSize { planes: 0, copy };
         }
         ScratchSize { planes: cut.bases * ((cut.rows + shifts) * self.width(false)).max(cut.rows * self.width(true)), copy }
@@ -443,7 +443,7 @@ impl Blur {
         let all = self.homographies.len();
         let width = self.width(true).max(self.latent.0);
         // A base costs its warp or its taps, whichever dispatch takes longer.
-        let cost = (self.taps as f64 / all as f64).max(WARP_COST as f64) * width as f64;
+        let cost = (self.taps as f64 / all as f64).max(crate::tsf::WARP_COST * (2 * self.support).pow(2) as f64) * width as f64;
         let budget = gpu.dispatch_budget / cost;
         // Shifts make neighbouring bands compute the same rows twice: rather fewer bases at once than low bands.
         let least = (2 * self.shifts().1 + 64).min(self.scratch_rows());
@@ -481,7 +481,7 @@ impl Blur {
     /// (tap table, first base, number of bases) of the passes that do `at_once` bases each.
     fn passes(&self, at_once: usize) -> Vec<(Option<&Chunk>, usize, usize)> {
         let parts = |first: usize, end: usize| (first..end).step_by(at_once).map(move |b| (b, at_once.min(end - b)));
-        if self.direct() {
+        if self.direct {
             return parts(0, self.homographies.len()).map(|(b, n)| (None, b, n)).collect();
         }
         self.chunks.iter().flat_map(|c| parts(c.first, c.first + c.count).map(move |(b, n)| (Some(c), b, n))).collect()
