@@ -3,13 +3,15 @@
 
 mod rotate_shift;
 
-use criterion::{BenchmarkId, Criterion};
+use criterion::Criterion;
 use rotate_shift::RotateShift;
-use std::time::{Duration, Instant};
+use std::time::Instant;
+use unshaken::deblur::{self, Observation, Settings};
 use unshaken::gpu::{Gpu, Step, read};
-use unshaken::kernels::{Blur, Channels, Kernels, Scratch, channels};
+use unshaken::image::{Plane, Rgb};
+use unshaken::kernels::{Blur, Channels, Kernels, NOISE_STEPS, Scratch, channels};
 use unshaken::pose::Pose;
-use unshaken::tsf::{Interpolation, Tap, TapSet};
+use unshaken::tsf::{Interpolation, Tap, TapSet, Tsf};
 
 /// Side of the workload's square frame, pixels.
 const SIDE: usize = 1024;
@@ -39,7 +41,7 @@ fn workload() -> TapSet {
 struct Device {
     gpu: Gpu,
     frame: Channels,
-    latent: Channels,
+    back: Channels,
     forward: Vec<Step>,
     adjoint: Vec<Step>,
 }
@@ -65,7 +67,7 @@ impl Device {
         let back = channels(&gpu, "back", SIDE * SIDE).expect("memory");
         let forward = blur.forward(&gpu, &kernels.blur, &scratch, &latent, &frame);
         let adjoint = blur.adjoint(&gpu, &kernels.blur, &scratch, &latent, &back, 1.0);
-        Self { gpu, frame, latent, forward, adjoint }
+        Self { gpu, frame, back, forward, adjoint }
     }
 
     fn run(&self, steps: &[Step]) {
@@ -100,32 +102,81 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
+/// One shaken frame under the workload's motion, and a flat start.
+fn observation(taps: &TapSet, image: &[Vec<f32>; 3]) -> (Observation, Rgb) {
+    let plane = |c: usize| Plane::from_vec(SIDE, SIDE, image[c].iter().map(|v| 0.1 + 0.8 * v).collect()).expect("the frame's size");
+    let poses = taps.taps.iter().map(|t| {
+        let angle = 0.25 * (t.base as f64 - 6.0);
+        Pose::planar(f64::from(t.dx), f64::from(t.dy), angle, t.weight)
+    });
+    let observation = Observation {
+        exposure: Rgb([plane(0), plane(1), plane(2)]),
+        mask: Plane::filled(SIDE, SIDE, 1.0),
+        exposure_time: 1.0,
+        noise: std::array::from_fn(|_| vec![0.02; NOISE_STEPS]),
+        black_clipped: false,
+        tsf: Tsf::new(1000.0, poses.collect()).expect("a motion"),
+    };
+    (observation, Rgb::filled(SIDE, SIDE, 0.5))
+}
+
 fn main() {
     let taps = workload();
     let image = [noise(1), noise(2), noise(3)];
     let device = Device::new(&taps, &image);
     let cpu = RotateShift::new(&taps, SIDE, SIDE);
     let mut out = image.clone();
+    println!(
+        "{}, {} threads; K and its adjoint, {SIDE} x {SIDE} pixels, 3 channels, 64 poses",
+        device.gpu.description,
+        rayon::current_num_threads()
+    );
 
-    // The two must compute the same before their times compare.
+    // Both must compute the same before their times compare.
+    let same = |what: &str, buffer: &wgpu::Buffer, expected: &[f32]| {
+        let got = read(&device.gpu, buffer, SIDE * SIDE).expect("the device answers");
+        let worst = got.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-4, "{what}: the two differ by {worst}");
+    };
     device.run(&device.forward);
     cpu.forward(&image, &mut out);
-    let on_device = read(&device.gpu, &device.frame[0], SIDE * SIDE).expect("the device answers");
-    let worst = on_device.iter().zip(&out[0]).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(worst < 1e-4, "K: the two differ by {worst}");
-
-    let mut rows: [Vec<f64>; 4] = Default::default();
+    same("K", &device.frame[0], &out[0]);
     device.run(&device.adjoint);
-    for _ in 0..std::env::var("ROUNDS").ok().and_then(|v| v.parse().ok()).unwrap_or(9) {
-        rows[0].push(time(|| device.run(&device.forward)));
-        rows[1].push(time(|| cpu.forward(&image, &mut out)));
-        rows[2].push(time(|| device.run(&device.adjoint)));
-        rows[3].push(time(|| cpu.adjoint(&image, &mut out)));
+    cpu.adjoint(&image, &mut out);
+    same("adjoint of K", &device.back[0], &out[0]);
+
+    let rounds = std::env::var("ROUNDS").ok().and_then(|v| v.parse().ok()).unwrap_or(9);
+    let mut times: [Vec<f64>; 4] = Default::default();
+    for _ in 0..rounds {
+        times[0].push(time(|| device.run(&device.forward)));
+        times[1].push(time(|| cpu.forward(&image, &mut out)));
+        times[2].push(time(|| device.run(&device.adjoint)));
+        times[3].push(time(|| cpu.adjoint(&image, &mut out)));
     }
-    let [k, k_cpu, t, t_cpu] = rows.each_mut().map(|r| median(r));
-    println!("K {k:.1} ms, CPU {k_cpu:.1} ms, ratio {:.2}", k / k_cpu);
-    println!("KT {t:.1} ms, CPU {t_cpu:.1} ms, ratio {:.2}", t / t_cpu);
-    let ratios = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| format!("{:.2}", a / b)).collect::<Vec<_>>().join(" ");
-    println!("{}\n{}", ratios(&rows[0], &rows[1]), ratios(&rows[2], &rows[3]));
-    let _ = (&device.latent, Duration::ZERO, BenchmarkId::from_parameter(1), Criterion::default());
+    let [k, k_cpu, t, t_cpu] = times.each_mut().map(|r| median(r));
+    println!("| | device, ms | CPU, ms | ratio |\n|---|---|---|---|");
+    println!("| K | {k:.0} | {k_cpu:.0} | {:.2} |\n| adjoint of K | {t:.0} | {t_cpu:.0} | {:.2} |", k / k_cpu, t / t_cpu);
+
+    // An iteration: the difference between long and short solves.
+    let (observation, start) = observation(&taps, &image);
+    let kernels = Kernels::new(&device.gpu, Interpolation::Bilinear);
+    let solve = |inner: usize| {
+        let settings = Settings { outer: 1, inner, ..Settings::default() };
+        time(|| drop(deblur::solve(&device.gpu, &kernels, std::slice::from_ref(&observation), &start, 0, &settings, &mut |_| true)))
+    };
+    let mut differences: Vec<f64> = (0..rounds.div_ceil(4)).map(|_| (solve(7) - solve(2)) / 5.0).collect();
+    let iteration = median(&mut differences);
+    println!(
+        "An iteration of the conjugate gradients: {iteration:.0} ms; beside K and its adjoint {:.1} %",
+        100.0 * (iteration / (k + t) - 1.0)
+    );
+
+    let mut criterion = Criterion::default().sample_size(10).configure_from_args();
+    let mut group = criterion.benchmark_group("64 poses");
+    group.bench_function("K, device", |b| b.iter(|| device.run(&device.forward)));
+    group.bench_function("K, CPU", |b| b.iter(|| cpu.forward(&image, &mut out)));
+    group.bench_function("adjoint, device", |b| b.iter(|| device.run(&device.adjoint)));
+    group.bench_function("adjoint, CPU", |b| b.iter(|| cpu.adjoint(&image, &mut out)));
+    group.finish();
+    criterion.final_summary();
 }
