@@ -145,7 +145,7 @@ fn main() {
     cpu.adjoint(&image, &mut out);
     same("adjoint of K", &device.back[0], &out[0]);
 
-    let rounds = std::env::var("ROUNDS").ok().and_then(|v| v.parse().ok()).unwrap_or(9);
+    let rounds: usize = std::env::var("ROUNDS").ok().and_then(|v| v.parse().ok()).unwrap_or(9);
     let mut times: [Vec<f64>; 4] = Default::default();
     for _ in 0..rounds {
         times[0].push(time(|| device.run(&device.forward)));
