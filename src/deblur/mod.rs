@@ -24,8 +24,8 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, ScratchSize, WeightTarget,
-    channels, partials_1d, partials_2d,
+    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, ScratchSize,
+    WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use memory::{Need, Plan};

@@ -232,9 +232,7 @@ impl TsfFile {
             focal_px: e.focal_px * factor,
             poses: e.poses.iter().map(|p| Pose { t_x: factor * p.t_x, t_y: factor * p.t_y, ..*p }).collect(),
             // In pixels: the third column grows with the frame, the third row shrinks.
-            base: e.base.map(|[[a, b, c], [d, f, g], [h, i, j]]| {
-                [[a, b, c * factor], [d, f, g * factor], [h / factor, i / factor, j]]
-            }),
+            base: e.base.map(|[[a, b, c], [d, f, g], [h, i, j]]| [[a, b, c * factor], [d, f, g * factor], [h / factor, i / factor, j]]),
             ..e.clone()
         });
         Self::new(frames.collect())

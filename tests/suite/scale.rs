@@ -141,7 +141,7 @@ fn a_reduced_motion_is_the_same_motion() {
         let (full, part) = (p.apply(tsf.focal_px, at), q.apply(small.focal_px, 0.25 * at));
         assert!((0.25 * full - part).length() < 1e-9, "{full} {part}");
     }
-    let entry = TsfEntry { frame: "a.png".into(), width: 1003, height: 662, focal_px: 900.0, poses: tsf.poses.clone() };
+    let entry = TsfEntry { frame: "a.png".into(), width: 1003, height: 662, focal_px: 900.0, poses: tsf.poses.clone(), base: None };
     let file = TsfFile::new(vec![entry]).reduced(4);
     let found = file.find("a.png", 250, 165).expect("fits").expect("there");
     assert_eq!((found.focal_px, found.poses[23].t_x), (225.0, 0.25 * tsf.poses[23].t_x));
@@ -149,7 +149,7 @@ fn a_reduced_motion_is_the_same_motion() {
 
 #[test]
 fn bad_motions_and_pixels_are_refused_by_name() {
-    let entry = |poses: Vec<Pose>| TsfEntry { frame: "a.png".into(), width: 60, height: 40, focal_px: 80.0, poses };
+    let entry = |poses: Vec<Pose>| TsfEntry { frame: "a.png".into(), width: 60, height: 40, focal_px: 80.0, poses, base: None };
     let refuse = |poses: Vec<Pose>| TsfFile::new(vec![entry(poses)]).find("a.png", 60, 40).expect_err("refused").to_string();
     let cases = [
         (vec![], "at least one pose"),
