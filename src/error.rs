@@ -43,7 +43,7 @@ pub enum Error {
     #[error("{0}")]
     Adapter(String),
     /// The device ran out of memory.
-    #[error("the GPU ran out of memory ({0}); use smaller frames")]
+    #[error("the GPU ran out of memory ({0}); raise --memory-limit if you set it, or reduce the frames with --scale")]
     OutOfMemory(String),
     /// The device was lost or did not answer in time.
     #[error("the GPU stopped answering ({0}); update its driver or choose the CPU adapter (WGPU_ADAPTER_NAME=llvmpipe)")]

@@ -27,7 +27,7 @@ impl Bracket {
     ///
     /// # Errors
     /// [`Error::Bracket`], naming the frame, for fewer than two frames, frames of different size, an exposure time
-    /// that is not a positive finite number, frames that all have the same exposure time, and frames that are all
+    /// that is not a positive finite number, intensities that are NaN or infinite, frames that all have the same exposure time, and frames that are all
     /// clipped or all black.
     pub fn new(frames: Vec<Frame>) -> Result<Self> {
         if frames.len() < 2 {
@@ -44,6 +44,13 @@ impl Bracket {
                     "{}: is {w} x {h} pixels but {} is {} x {}; all frames must have one size",
                     f.name, frames[0].name, size.0, size.1
                 )));
+            }
+            for (plane, channel) in f.intensity.0.iter().zip(["red", "green", "blue"]) {
+                if let Some(i) = plane.data.iter().position(|v| !v.is_finite()) {
+                    let (x, y, value) = (i % size.0, i / size.0, plane.data[i]);
+                    let text = format!("{}: {channel} of pixel ({x}, {y}) is {value}; intensities are numbers from 0 to 1", f.name);
+                    return Err(Error::Bracket(text));
+                }
             }
             if !(f.exposure_time.is_finite() && f.exposure_time > 0.0) {
                 return Err(Error::Bracket(format!(

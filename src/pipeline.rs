@@ -439,9 +439,13 @@ impl Run<'_> {
         let moving = observations.iter().any(|o| !o.tsf.is_identity());
         let stage = if moving { "deblurring" } else { "merging the sharp frames" };
         let events = &mut self.events;
-        deblur::solve(&self.gpu, &self.kernels, &observations, initial, pad, settings, &mut |f| {
+        let solved = deblur::solve(&self.gpu, &self.kernels, &observations, initial, pad, settings, &mut |f| {
             events(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f })
-        })
+        })?;
+        if solved.report.memory.reduced {
+            self.warn("the GPU's memory is short: the work is done in smaller pieces, which takes longer".into())?;
+        }
+        Ok(solved)
     }
 
     /// Merge of the frames `ids` on the reference's grid, to start from.

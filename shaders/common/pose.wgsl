@@ -9,6 +9,7 @@ struct Base {
     // The forward map H p = p + displacement, in the same form: where to look for the targets of a source pixel.
     abc_inverse: vec4f,
     def_inverse: vec4f,
+    weight: vec4f,        // of what the warp adds, three times nothing
 }
 
 fn displacement(abc: vec4f, def: vec4f, p: vec2f) -> vec2f {
@@ -33,4 +34,18 @@ fn interpolation(x: f32) -> f32 {
     let middle = ((-7.0 / 12.0 * t + 3.0) * t - 59.0 / 12.0) * t + 2.5;
     let outer = ((1.0 / 12.0 * t - 2.0 / 3.0) * t + 1.75) * t - 1.5;
     return select(select(select(outer, 0.0, t >= 3.0), middle, t < 2.0), inner, t < 1.0);
+}
+
+// `interpolation` of four distances.
+fn interpolation4(x: vec4f) -> vec4f {
+    let t = abs(x);
+    if SUPPORT == 1 {
+        return max(1.0 - t, vec4f(0.0));
+    }
+    if SUPPORT == 2 {
+        let inner = (1.5 * t - 2.5) * t * t + 1.0;
+        let outer = ((-0.5 * t + 2.5) * t - 4.0) * t + 2.0;
+        return select(select(outer, vec4f(0.0), t >= vec4f(2.0)), inner, t < vec4f(1.0));
+    }
+    return vec4f(interpolation(x.x), interpolation(x.y), interpolation(x.z), interpolation(x.w));
 }

@@ -75,6 +75,12 @@ pub(super) struct MergeArgs {
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,
+    /// Solve at a reduced size, for a quick look: 0.5, 0.25, ... (one over a whole number)
+    #[arg(long, value_name = "S", allow_hyphen_values = true)]
+    pub scale: Option<String>,
+    /// Most GPU memory to use, such as 2GiB or 800MiB; less is slower [default: all there is]
+    #[arg(long, value_name = "SIZE", allow_hyphen_values = true)]
+    pub memory_limit: Option<String>,
     /// Write a tone-mapped picture of the result
     #[arg(long, value_name = "OUT.png")]
     pub preview: Option<PathBuf>,

@@ -16,6 +16,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
+    let divisor = args.scale.as_deref().map_or(Ok(1), divisor)?;
     frames::check(&args.frames)?;
     let given = args.response.as_deref().filter(|r| *r != "auto");
     let named = given.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
@@ -47,6 +48,11 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
             let (w, h) = bracket.size();
             settings.focal_px = frames::focal_px(&args.frames[0], w, h)?;
         }
+        // Lengths in pixels shrink with the frames.
+        settings.focal_px = settings.focal_px.map(|f| f / divisor as f64);
+        settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
+        let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
+        let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
         let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
 
@@ -121,6 +127,7 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         "six-point" => Interpolation::SixPoint,
         _ => Interpolation::Bilinear,
     });
+    settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
         return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));
@@ -132,6 +139,32 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         return Err(Usage(format!("--exclude leaves out all {}; keep at least one", frames::count(n, "frame"))));
     }
     Ok(settings)
+}
+
+/// The whole number that `--scale` is one over.
+fn divisor(word: &str) -> Result<usize, Usage> {
+    let divisor = word.parse::<f64>().ok().filter(|s| *s > 0.0 && *s <= 1.0).map(|s| (1.0 / s, (1.0 / s).round()));
+    match divisor {
+        Some((exact, whole)) if (exact - whole).abs() <= 0.02 * whole && whole <= 1000.0 => Ok(whole as usize),
+        _ => Err(Usage(format!("--scale: {word:?} is not one over a whole number; give 1, 0.5, 0.333, 0.25, ..."))),
+    }
+}
+
+/// Bytes of a size such as 2GiB, 1.5GB or 800MiB.
+fn bytes(word: &str) -> Result<u64, Usage> {
+    let split = word.find(|c: char| c.is_alphabetic()).unwrap_or(word.len());
+    let (number, unit) = word.split_at(split);
+    let unit = match unit.to_lowercase().as_str() {
+        "gib" | "g" => 1u64 << 30,
+        "mib" | "m" => 1 << 20,
+        "gb" => 1_000_000_000,
+        "mb" => 1_000_000,
+        _ => 0,
+    };
+    match number.trim().parse::<f64>() {
+        Ok(n) if n.is_finite() && n > 0.0 && unit > 0 => Ok((n * unit as f64) as u64),
+        _ => Err(Usage(format!("--memory-limit: {word:?} is not a size; give a number with a unit, such as 2GiB or 800MiB"))),
+    }
 }
 
 /// Frame number, counted from 1, to an index.

@@ -16,15 +16,21 @@
 //! an outer step lowers the objective by less than `settled` of it. The iteration stops when a step under these weights lowers
 //! it by less than `tolerance` of it, or at `outer` steps.
 
+mod memory;
+
+pub use memory::Memory;
+
 use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, WeightTarget,
-    channels, partials_1d, partials_2d,
+    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, Scratch, ScratchSize,
+    WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
+use memory::{Need, Plan};
 use serde::Serialize;
+use std::sync::Arc;
 
 /// One frame as the solver sees it.
 pub struct Observation {
@@ -64,6 +70,8 @@ pub struct Settings {
     pub reweight: bool,
     /// Interpolation of the warps.
     pub interpolation: Interpolation,
+    /// Most bytes of device memory; `None`: as many as there are.
+    pub memory_limit: Option<u64>,
 }
 
 impl Default for Settings {
@@ -78,6 +86,7 @@ impl Default for Settings {
             settled: 0.3,
             reweight: true,
             interpolation: Interpolation::default(),
+            memory_limit: None,
         }
     }
 }
@@ -115,6 +124,8 @@ pub struct SolveReport {
     pub history: Vec<Iteration>,
     /// Mean squared residual over variance of each frame, where it is not masked: 1 is what noise explains.
     pub chi_squared: Vec<f64>,
+    /// Device memory that it took.
+    pub memory: Memory,
 }
 
 /// Irradiance and how it was reached.
@@ -192,6 +203,16 @@ struct Observed {
     mask: wgpu::Buffer,
     misfit: wgpu::Buffer,
     moving: Option<Moving>,
+    /// Exposure and mask, when their buffers are shared and have to be filled before use.
+    host: Option<[Arc<Vec<f32>>; 4]>,
+}
+
+impl Observed {
+    /// Steps after which exposure and mask are on the device.
+    fn uploads(&self) -> Vec<Step> {
+        let to = self.exposure.iter().chain(std::iter::once(&self.mask));
+        self.host.iter().flatten().zip(to).map(|(values, buffer)| Step::Upload(values.clone(), buffer.clone())).collect()
+    }
 }
 
 struct State {
@@ -228,6 +249,7 @@ struct Solver<'a> {
     frame: (usize, usize),
     latent: (usize, usize),
     pad: usize,
+    memory: Memory,
 }
 
 fn upload_rgb(gpu: &Gpu, label: &str, image: &Rgb) -> Result<Channels> {
@@ -266,7 +288,21 @@ pub fn solve(
     settings: &Settings,
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Solution> {
-    Solver::new(gpu, kernels, observations, initial, pad, settings)?.run(progress)
+    let (mut limit, mut reduced) = (settings.memory_limit.unwrap_or(u64::MAX), false);
+    loop {
+        match Solver::new(gpu, kernels, observations, initial, pad, settings, limit) {
+            // The device has less room than was planned with: a smaller plan, until none is left.
+            Err(Error::OutOfMemory(_)) if gpu.counted() > 0 => {
+                limit = gpu.counted().min(limit) / 16 * 15;
+                reduced = true;
+            }
+            solver => {
+                let mut solver = solver?;
+                solver.memory.reduced = reduced;
+                return solver.run(progress);
+            }
+        }
+    }
 }
 
 impl<'a> Solver<'a> {
@@ -277,7 +313,9 @@ impl<'a> Solver<'a> {
         initial: &Rgb,
         pad: usize,
         settings: &'a Settings,
+        limit: u64,
     ) -> Result<Self> {
+        gpu.start_count();
         let latent = initial.size();
         check(observations, initial)?;
         let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
@@ -293,52 +331,87 @@ impl<'a> Solver<'a> {
                 })
             })
             .collect();
-        let any_moving = blurs.iter().any(Option::is_some);
-        let wanted = blurs.iter().flatten().map(|b| b.0.scratch_wanted()).max().unwrap_or(0);
-        let needed = blurs.iter().flatten().map(|b| b.0.scratch_needed()).max().unwrap_or(0);
+        let shaken = blurs.iter().flatten().count();
+        if n.max(2 * m) > gpu.max_binding() {
+            return Err(Error::Adapter(format!(
+                "frames of {} x {} pixels: {} allows {} MiB per binding, less than they need; reduce them with --scale, or use another adapter",
+                frame.0,
+                frame.1,
+                gpu.description,
+                gpu.max_binding() >> 18
+            )));
+        }
+        let scratch =
+            |size: fn(&Blur) -> ScratchSize| blurs.iter().flatten().map(|b| size(&b.0)).fold(ScratchSize::default(), ScratchSize::max);
+        let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
         // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let scratch = Scratch::new(gpu, wanted.min((1 << 25).min(gpu.max_plane()).max(needed)))?;
+        let most = (1 << 25).min(gpu.max_binding());
+        let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
+        let need = Need {
+            latent: n,
+            frame: m,
+            frames: observations.len(),
+            shaken,
+            partials,
+            scratch_wanted: wanted.min(ScratchSize { planes: most, copy: most }.max(needed)),
+            scratch_needed: needed,
+        };
+        let Plan { memory, scratch } = need.plan(limit)?;
+        let scratch = Scratch::new(gpu, scratch)?;
         let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
         let ch = |label, count| channels(gpu, label, count);
-        let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
+        // Vectors that are never alive together share a buffer: see the order of the steps in `run`.
+        let (residual, scaled) = (ch("residual of the step", n)?, ch("scaled direction, product", n)?);
+        let (solution, direction, back) = (ch("step", n)?, ch("search direction", n)?, ch("back-projection", n)?);
+        let any_moving = shaken > 0;
         let state = State {
             irradiance: upload_rgb(gpu, "irradiance", &initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE))))?,
             log: upload_rgb(gpu, "log irradiance", &log)?,
-            old: ch("log irradiance before the step", n)?,
-            solution: ch("step", n)?,
-            residual: ch("residual of the step", n)?,
-            direction: ch("search direction", n)?,
-            product: ch("product", n)?,
-            scaled: ch("scaled direction", n)?,
-            back: ch("back-projection", n)?,
+            // The log irradiance before the step is kept when the residual of the step is no longer needed.
+            old: residual.clone(),
+            solution,
+            residual,
+            // The product is written after the scaled direction was projected, the data diagonal read before there is one.
+            product: scaled.clone(),
+            data_diagonal: scaled.clone(),
+            scaled,
+            back,
             diagonal: ch("preconditioner", n)?,
-            data_diagonal: ch("data diagonal", n)?,
             weight: ch("weights of sharp frames", n)?,
             observation: ch("observations of sharp frames", n)?,
             edge: gpu.plane("edge weights", n)?,
             predicted: ch("prediction", if any_moving { m } else { 1 })?,
-            frame: ch("frame", if any_moving { m } else { 1 })?,
+            // Residuals of frames are back-projected before there is a search direction.
+            frame: direction.clone(),
+            direction,
             misfit_scratch: gpu.plane("misfit", 2 * m)?,
             partials: gpu.plane("partial sums", partials)?,
             scalars: gpu.plane("scalars", 8)?,
             scratch,
         };
+        let misfit = gpu.plane("misfit", 2 * m)?;
         let mut observed = Vec::new();
-        for (o, blur) in observations.iter().zip(blurs) {
+        for (i, (o, blur)) in observations.iter().zip(blurs).enumerate() {
             let moving = match blur {
                 None => None,
                 Some((blur, still, energy)) => {
                     Some(Moving { blur, still, energy, weight: ch("weights", m)?, observation: ch("observations", m)? })
                 }
             };
-            observed.push(Observed {
-                exposure: upload_rgb(gpu, "exposure", &o.exposure)?,
-                mask: gpu.upload("mask", &o.mask.data)?,
-                misfit: gpu.plane("misfit", 2 * m)?,
-                moving,
-            });
+            let misfit = misfit.clone();
+            if memory.streamed {
+                // Weights are made when there is neither a step nor a back-projection.
+                let planes = o.exposure.0.iter().chain(std::iter::once(&o.mask));
+                let mut host = planes.map(|p| gpu::finite(&format!("frame {}", i + 1), &p.data).map(|()| Arc::new(p.data.clone())));
+                let mut next = || host.next().expect("four planes");
+                let host = Some([next()?, next()?, next()?, next()?]);
+                observed.push(Observed { exposure: state.solution.clone(), mask: state.back[0].clone(), misfit, moving, host });
+            } else {
+                let (exposure, mask) = (upload_rgb(gpu, "exposure", &o.exposure)?, gpu.upload("mask", &o.mask.data)?);
+                observed.push(Observed { exposure, mask, misfit, moving, host: None });
+            }
         }
-        let mut solver = Self { gpu, kernels, settings, observations, observed, state, frame, latent, pad };
+        let mut solver = Self { gpu, kernels, settings, observations, observed, state, frame, latent, pad, memory };
         solver.mask_beyond()?;
         Ok(solver)
     }
@@ -346,14 +419,18 @@ impl<'a> Solver<'a> {
     /// Takes the pixels of blurred frames out of the masks that see beyond the latent grid: K of ones is less than 1 there.
     fn mask_beyond(&mut self) -> Result<()> {
         let (n, m) = (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1);
-        let one = self.gpu.upload("ones", &vec![1.0; n])?;
-        let ones: Channels = std::array::from_fn(|_| one.clone());
+        // There is no search direction yet.
+        let ones: Channels = std::array::from_fn(|_| self.state.direction[0].clone());
+        self.gpu.submit(&[Step::Upload(Arc::new(vec![1.0; n]), ones[0].clone())]);
         for (o, observed) in self.observations.iter().zip(&mut self.observed) {
             if let Some(moving) = &observed.moving {
                 self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &self.state.scratch, &ones, &self.state.predicted));
                 let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
                 let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
-                observed.mask = self.gpu.upload("mask", &mask)?;
+                match &mut observed.host {
+                    Some(host) => host[3] = Arc::new(mask),
+                    None => self.gpu.submit(&[Step::Upload(Arc::new(mask), observed.mask.clone())]),
+                }
             }
         }
         Ok(())
@@ -381,6 +458,7 @@ impl<'a> Solver<'a> {
         let mut steps = Vec::new();
         let mut first = true;
         for (i, observed) in self.observed.iter().enumerate() {
+            steps.extend(observed.uploads());
             match &observed.moving {
                 None => {
                     steps.push(Step::Clear(observed.misfit.clone()));
@@ -608,6 +686,7 @@ impl<'a> Solver<'a> {
             if let Some(moving) = &observed.moving {
                 self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.kernels), &s.scratch, &s.irradiance, &s.predicted));
             }
+            self.gpu.submit(&observed.uploads());
             let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);
             self.gpu.submit(&steps[..1]);
             let pairs = gpu::read(self.gpu, &observed.misfit, 2 * m)?;
@@ -621,6 +700,6 @@ impl<'a> Solver<'a> {
         let n = self.latent.0 * self.latent.1;
         let plane = |c: usize| Plane::from_vec(self.latent.0, self.latent.1, gpu::read(self.gpu, &s.irradiance[c], n)?);
         let irradiance = Rgb([plane(0)?, plane(1)?, plane(2)?]);
-        Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared } })
+        Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared, memory: self.memory } })
     }
 }

@@ -1,6 +1,7 @@
 //! A compute pipeline and its dispatches.
 
 use super::Gpu;
+use std::sync::Arc;
 
 /// One compiled kernel: binding 0 is its uniform `Params`, storage buffers follow in order.
 pub struct Kernel {
@@ -25,6 +26,8 @@ pub enum Step {
     Copy(wgpu::Buffer, wgpu::Buffer),
     /// A buffer filled with zeros.
     Clear(wgpu::Buffer),
+    /// Values from the host, to the start of a buffer: what does not stay on the device all the time.
+    Upload(Arc<Vec<f32>>, wgpu::Buffer),
 }
 
 /// Workgroups for `count` invocations of kernels with 128 lanes, as (per row, rows): one dimension holds 65 535 at most.
@@ -54,11 +57,17 @@ impl Kernel {
 
     /// A dispatch of `groups` workgroups with these parameters and buffers.
     pub fn step<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], groups: [u32; 3]) -> Step {
+        let parts: Vec<_> = buffers.iter().map(|b| b.as_entire_buffer_binding()).collect();
+        self.step_parts(gpu, params, &parts, groups)
+    }
+
+    /// [`Kernel::step`] that sees only parts of its buffers.
+    pub fn step_parts<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, parts: &[wgpu::BufferBinding], groups: [u32; 3]) -> Step {
         let uniform = gpu.uniform(self.label, bytemuck::bytes_of(params));
-        let entries: Vec<_> = std::iter::once(&uniform)
-            .chain(buffers.iter().copied())
+        let entries: Vec<_> = std::iter::once(uniform.as_entire_buffer_binding())
+            .chain(parts.iter().cloned())
             .enumerate()
-            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: b.as_entire_binding() })
+            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: wgpu::BindingResource::Buffer(b) })
             .collect();
         let bindings =
             gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries });
@@ -83,6 +92,8 @@ pub(super) fn record(steps: &[Step], encoder: &mut wgpu::CommandEncoder) {
         match &run[0] {
             Step::Copy(from, to) => encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size()),
             Step::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
+            // Gpu::submit writes these: they are no commands.
+            Step::Upload(..) => {}
             Step::Dispatch { .. } => {
                 let mut pass = encoder.begin_compute_pass(&Default::default());
                 for step in run {

@@ -7,6 +7,7 @@ pub use kernel::{Kernel, Step, grid_1d};
 pub use readback::read;
 
 use crate::error::{Error, Result};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// What to install when no adapter is found, per system.
 const ADVICE: &str = "Linux: install your GPU's Vulkan driver, or the software one (Debian/Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1; \
@@ -29,7 +30,31 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name, backend and driver in one line.
     pub description: String,
+    /// Pixels times taps that one dispatch may compute: bounds its time, so that a slow driver's watchdog does not fire.
+    pub dispatch_budget: f64,
+    /// Most bytes that one binding may hold.
+    binding_limit: u64,
+    /// Most bytes of planes at a time.
+    memory_limit: u64,
+    /// Bytes of planes made since [`Gpu::start_count`].
+    counted: AtomicU64,
 }
+
+/// Some rows of an image in a buffer, as a dispatch sees them.
+pub struct Rows<'a> {
+    /// The part of the buffer.
+    pub binding: wgpu::BufferBinding<'a>,
+    /// Row of the image that comes first in it.
+    pub first: usize,
+}
+
+/// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
+/// alignment that every adapter accepts.
+const ROW_STEP: usize = 64;
+/// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 4e8 pixels times taps per second; 0.4 s.
+const BUDGET_CPU: f64 = 1.5e8;
+/// Of a GPU: the slowest integrated ones make about 2e10; 50 ms.
+const BUDGET_GPU: f64 = 1e9;
 
 fn describe(info: &wgpu::AdapterInfo) -> String {
     format!("{} ({:?}, {:?}, {} {})", info.name, info.backend, info.device_type, info.driver, info.driver_info)
@@ -67,6 +92,17 @@ pub fn list_adapters() -> Result<Vec<AdapterDescription>> {
     Ok(all.iter().enumerate().map(|(i, a)| AdapterDescription { description: describe(&a.get_info()), chosen: i == 0 }).collect())
 }
 
+/// Refuses what no kernel may see.
+///
+/// # Errors
+/// [`Error::Input`], naming `label`, for NaN or infinity.
+pub fn finite(label: &str, values: &[f32]) -> Result<()> {
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(i) => Err(Error::Input(format!("{label}: value {i} is {}; NaN and infinity are refused", values[i]))),
+        None => Ok(()),
+    }
+}
+
 impl Gpu {
     /// Opens the best adapter (see [`list_adapters`]).
     ///
@@ -84,29 +120,84 @@ impl Gpu {
         let descriptor = wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|e| Error::Adapter(format!("{}: refuses a device ({e}). {ADVICE}", describe(&info))))?;
-        Ok(Self { device, queue, description: describe(&info) })
+        let dispatch_budget = if info.device_type == wgpu::DeviceType::Cpu { BUDGET_CPU } else { BUDGET_GPU };
+        let limits = device.limits();
+        let binding_limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        let description = describe(&info);
+        Ok(Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0) })
     }
 
-    /// Largest number of `f32` that one storage binding may hold.
+    /// The same with `bytes` of memory for planes at most, as on an adapter that has no more.
+    pub fn with_memory_limit(self, bytes: u64) -> Self {
+        Self { memory_limit: bytes, ..self }
+    }
+
+    /// Forgets the planes made so far, which whoever made them has given back.
+    pub fn start_count(&self) {
+        self.counted.store(0, Ordering::Relaxed);
+    }
+
+    /// Bytes of planes made since [`Gpu::start_count`].
+    pub fn counted(&self) -> u64 {
+        self.counted.load(Ordering::Relaxed)
+    }
+
+    /// The same with bindings of at most `bytes`, as on an adapter that allows no more.
+    pub fn with_binding_limit(self, bytes: u64) -> Self {
+        Self { binding_limit: self.binding_limit.min(bytes), ..self }
+    }
+
+    /// Most `f32` that one storage binding may hold.
+    pub fn max_binding(&self) -> usize {
+        (self.binding_limit / 4) as usize
+    }
+
+    /// Most `f32` that one buffer may hold.
     pub fn max_plane(&self) -> usize {
-        let limits = self.device.limits();
-        (limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) / 4) as usize
+        (self.device.limits().max_buffer_size / 4) as usize
+    }
+
+    /// Whether [`Gpu::rows`] can bind any `rows` consecutive rows of an image of `size` = (width, height) `f32`.
+    pub fn rows_fit(&self, rows: usize, size: (usize, usize)) -> bool {
+        (rows + ROW_STEP).min(size.1) * size.0 <= self.max_binding()
+    }
+
+    /// The rows `rows` of an image of `width` values per row: the whole buffer where one binding holds it, else a part that begins at or
+    /// a little before `rows`.
+    pub fn rows<'a>(&self, buffer: &'a wgpu::Buffer, width: usize, rows: std::ops::Range<usize>) -> Rows<'a> {
+        if buffer.size() <= self.binding_limit {
+            return Rows { binding: buffer.as_entire_buffer_binding(), first: 0 };
+        }
+        let last = (buffer.size() / 4) as usize / width;
+        let first = rows.start.min(last.saturating_sub(1)) / ROW_STEP * ROW_STEP;
+        let (offset, end) = ((first * width * 4) as u64, (rows.end.clamp(first + 1, last) * width * 4) as u64);
+        debug_assert!(end - offset <= self.binding_limit, "callers ask rows_fit");
+        Rows { binding: wgpu::BufferBinding { buffer, offset, size: std::num::NonZero::new(end - offset) }, first }
     }
 
     /// A storage buffer of `count` zeros.
     ///
     /// # Errors
-    /// [`Error::OutOfMemory`] when the buffer is larger than the device allows.
+    /// [`Error::OutOfMemory`] when the buffer is larger than the device allows, or finds no room.
     pub fn plane(&self, label: &str, count: usize) -> Result<wgpu::Buffer> {
         if count > self.max_plane() {
-            return Err(Error::OutOfMemory(format!("{label}: {count} values are more than one binding of this adapter holds")));
+            return Err(Error::OutOfMemory(format!("{label}: {count} values are more than one buffer of this adapter holds")));
         }
-        Ok(self.device.create_buffer(&wgpu::BufferDescriptor {
+        let size = (count.max(2) * 4) as u64;
+        if self.counted.fetch_add(size, Ordering::Relaxed) + size > self.memory_limit {
+            return Err(Error::OutOfMemory(format!("{label}: {size} bytes")));
+        }
+        let scope = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
-            size: (count.max(2) * 4) as u64,
+            size,
             usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
-        }))
+        });
+        match pollster::block_on(scope.pop()) {
+            Some(_) => Err(Error::OutOfMemory(format!("{label}: {size} bytes"))),
+            None => Ok(buffer),
+        }
     }
 
     /// A storage buffer that holds `values`.
@@ -114,9 +205,7 @@ impl Gpu {
     /// # Errors
     /// [`Error::Input`] for NaN or infinity, which no kernel may see; otherwise as [`Gpu::plane`].
     pub fn upload(&self, label: &str, values: &[f32]) -> Result<wgpu::Buffer> {
-        if let Some(i) = values.iter().position(|v| !v.is_finite()) {
-            return Err(Error::Input(format!("{label}: value {i} is {}; NaN and infinity are refused", values[i])));
-        }
+        finite(label, values)?;
         let buffer = self.plane(label, values.len())?;
         self.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(values));
         Ok(buffer)
@@ -149,11 +238,18 @@ impl Gpu {
 
     /// Runs steps and waits for none of them.
     pub fn submit(&self, steps: &[Step]) {
-        // A submission is bounded so that a slow driver's watchdog does not fire.
-        for part in steps.chunks(4096) {
-            let mut encoder = self.device.create_command_encoder(&Default::default());
-            kernel::record(part, &mut encoder);
-            self.queue.submit([encoder.finish()]);
+        // A submission is bounded so that a slow driver's watchdog does not fire. Uploads stand between submissions.
+        for run in steps.chunk_by(|a, b| matches!(a, Step::Upload(..)) == matches!(b, Step::Upload(..))) {
+            for part in run.chunks(1024) {
+                let mut encoder = self.device.create_command_encoder(&Default::default());
+                kernel::record(part, &mut encoder);
+                for step in part {
+                    if let Step::Upload(values, buffer) = step {
+                        self.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
+                    }
+                }
+                self.queue.submit([encoder.finish()]);
+            }
         }
     }
 }

@@ -1,11 +1,21 @@
-//! The blur K of eq. (4) and its exact adjoint Kᵀ, three channels, as base warps and shifts (see [`TapSet`]).
+//! The blur K of eq. (4) and its exact adjoint Kᵀ, three channels, as warps and shifts (see [`TapSet`]), in two designs:
+//!
+//! * rotate-then-shift: every base warp into a scratch plane, then the sum of shifted planes. Loads little, needs scratch.
+//! * direct: every pose warped straight into the sum. For a set whose taps shift nothing (a pose of its own per tap), above all for a
+//!   frame with a single pose.
+//!
+//! Both run in bands of frame rows, as tall as scratch, bindings and the time that a dispatch may take allow. K computes a band of the
+//! frame from the scratch rows that its shifts reach; Kᵀ adds to the latent grid what a band of scratch rows holds. What either reads is
+//! copied with a margin of zeros first.
 
 use super::Channels;
 use crate::error::Result;
 use crate::gpu::{Gpu, Kernel, Step};
 use crate::tsf::{Interpolation, TapSet};
 use glam::{DMat3, DVec2};
+use std::ops::Range;
 
+pub(super) const PADDED: &str = concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/padded.wgsl"));
 pub(super) const WARP: &str = concat!(
     include_str!("../../shaders/common/plane.wgsl"),
     include_str!("../../shaders/common/pose.wgsl"),
@@ -16,24 +26,51 @@ pub(super) const WARP_ADJOINT: &str = concat!(
     include_str!("../../shaders/common/pose.wgsl"),
     include_str!("../../shaders/warp_adjoint.wgsl")
 );
+pub(super) const WARP_ADJOINT_NEAR: &str = concat!(
+    include_str!("../../shaders/common/plane.wgsl"),
+    include_str!("../../shaders/common/pose.wgsl"),
+    include_str!("../../shaders/warp_adjoint_near.wgsl")
+);
 pub(super) const TAP_SUM: &str = include_str!("../../shaders/tap_sum.wgsl");
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct PaddedParams {
+    in_size: [i32; 2],
+    out_size: [i32; 2],
+    origin: [i32; 2],
+    in_first: i32,
+    _pad: i32,
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct WarpParams {
-    size: [i32; 2],
-    scratch_size: [i32; 2],
-    scratch_origin: [i32; 2],
-    pad: [i32; 2],
+    in_size: [i32; 2],
+    offset: [i32; 2],
+    out_size: [i32; 2],
+    out_origin: [i32; 2],
     centre: [f32; 2],
+    out_first: i32,
     first_base: u32,
-    bases: u32,
+    span: u32,
+    accumulate: u32,
+    _pad: [u32; 2],
 }
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct WarpAdjointParams {
-    warp: WarpParams,
+    size: [i32; 2],
+    in_size: [i32; 2],
+    in_origin: [i32; 2],
+    pad: [i32; 2],
+    centre: [f32; 2],
+    rows: [i32; 2],
+    out_first: i32,
+    plane: u32,
+    first_base: u32,
+    bases: u32,
     reach: i32,
     factor: f32,
 }
@@ -41,13 +78,13 @@ struct WarpAdjointParams {
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct TapParams {
-    in_size: [i32; 2],
     out_size: [i32; 2],
-    origin: [i32; 2],
-    accumulate: u32,
+    in_stride: i32,
+    in_plane: i32,
     first_group: u32,
     span: u32,
-    first_plane: u32,
+    accumulate: u32,
+    out_first: i32,
 }
 
 #[repr(C)]
@@ -57,20 +94,29 @@ struct BaseTable {
     def: [f32; 4],
     abc_inverse: [f32; 4],
     def_inverse: [f32; 4],
+    weight: [f32; 4],
 }
 
 pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
-    vec![("warp", size_of::<WarpParams>()), ("warp_adjoint", size_of::<WarpAdjointParams>()), ("tap_sum", size_of::<TapParams>())]
+    vec![
+        ("padded", size_of::<PaddedParams>()),
+        ("warp", size_of::<WarpParams>()),
+        ("warp_adjoint", size_of::<WarpAdjointParams>()),
+        ("warp_adjoint_near", size_of::<WarpAdjointParams>()),
+        ("tap_sum", size_of::<TapParams>()),
+    ]
 }
 
 pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
-    vec![("warp", "Base", size_of::<BaseTable>()), ("warp_adjoint", "Base", size_of::<BaseTable>())]
+    ["warp", "warp_adjoint", "warp_adjoint_near"].map(|s| (s, "Base", size_of::<BaseTable>())).to_vec()
 }
 
 /// The compiled kernels of K and Kᵀ.
 pub struct BlurKernels {
+    padded: Kernel,
     warp: Kernel,
     warp_adjoint: Kernel,
+    warp_adjoint_near: Kernel,
     tap_sum: Kernel,
     support: usize,
 }
@@ -81,8 +127,10 @@ impl BlurKernels {
         let support = interpolation.support();
         let constants = [("SUPPORT", support as f64)];
         Self {
+            padded: Kernel::new(gpu, "padded", PADDED, &[]),
             warp: Kernel::new(gpu, "warp", WARP, &constants),
             warp_adjoint: Kernel::new(gpu, "warp_adjoint", WARP_ADJOINT, &constants),
+            warp_adjoint_near: Kernel::new(gpu, "warp_adjoint_near", WARP_ADJOINT_NEAR, &constants),
             tap_sum: Kernel::new(gpu, "tap_sum", TAP_SUM, &[]),
             support,
         }
@@ -96,32 +144,79 @@ fn displacement_table(h: &DMat3) -> ([f32; 4], [f32; 4]) {
     ([(x.x - 1.0) as f32, y.x as f32, z.x as f32, x.z as f32], [x.y as f32, (y.y - 1.0) as f32, z.y as f32, y.z as f32])
 }
 
-/// Largest absolute row sum of the Jacobian of `h` over a frame's corners and centre: how far a unit square spreads.
-fn spread(h: &DMat3, half: DVec2) -> f64 {
-    let mut worst = 0.0f64;
+/// Over a frame's corners and centre: the largest absolute row sum of the Jacobian of `h` (how far a unit square spreads) and the largest
+/// change of the displacement `h p - p` per pixel in x.
+fn spread(h: &DMat3, half: DVec2) -> (f64, f64) {
+    let (mut worst, mut drift) = (0.0f64, 0.0f64);
     for s in [DVec2::ZERO, DVec2::new(1.0, 1.0), DVec2::new(-1.0, 1.0), DVec2::new(1.0, -1.0), DVec2::new(-1.0, -1.0)] {
         let p = s * half;
         let (a, e) = (crate::pose::project(h, p), 0.5);
         let dx = (crate::pose::project(h, p + DVec2::new(e, 0.0)) - a) / e;
         let dy = (crate::pose::project(h, p + DVec2::new(0.0, e)) - a) / e;
         worst = worst.max(dx.x.abs() + dy.x.abs()).max(dx.y.abs() + dy.y.abs());
+        drift = drift.max((dx.x - 1.0).abs()).max(dx.y.abs());
     }
-    worst
+    (worst, drift)
 }
 
-/// Scratch planes for the base warps, shared by all operators of one solver.
+/// Rows that `h` maps the rectangle of `x` by `y` (centred pixels) to; `None` when part of it lies behind the camera.
+fn rows_of(h: &DMat3, x: (f64, f64), y: (f64, f64)) -> Option<(f64, f64)> {
+    let mut rows = (f64::INFINITY, f64::NEG_INFINITY);
+    for p in [DVec2::new(x.0, y.0), DVec2::new(x.1, y.0), DVec2::new(x.0, y.1), DVec2::new(x.1, y.1)] {
+        let q = *h * p.extend(1.0);
+        // A projective map with positive denominators takes the rectangle to the hull of its corners.
+        if q.z <= 1e-3 * h.z_axis.z.abs() {
+            return None;
+        }
+        rows = (rows.0.min(q.y / q.z), rows.1.max(q.y / q.z));
+    }
+    Some(rows)
+}
+
+/// Values per channel of the two parts of a [`Scratch`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ScratchSize {
+    /// Planes of the base warps.
+    pub planes: usize,
+    /// Copy with margin of what an operator reads.
+    pub copy: usize,
+}
+
+impl ScratchSize {
+    /// The larger of each part.
+    pub fn max(self, other: Self) -> Self {
+        Self { planes: self.planes.max(other.planes), copy: self.copy.max(other.copy) }
+    }
+
+    /// The smaller of each part.
+    pub fn min(self, other: Self) -> Self {
+        Self { planes: self.planes.min(other.planes), copy: self.copy.min(other.copy) }
+    }
+
+    /// Bytes of three channels.
+    pub fn bytes(self) -> u64 {
+        12 * (self.planes.max(2) + self.copy.max(2)) as u64
+    }
+}
+
+/// Scratch planes for copies and base warps, shared by all operators of one solver.
 pub struct Scratch {
     planes: Channels,
-    capacity: usize,
+    copy: Channels,
+    size: ScratchSize,
 }
 
 impl Scratch {
-    /// Scratch of `capacity` values per channel.
+    /// Scratch of `size`.
     ///
     /// # Errors
     /// As [`Gpu::plane`].
-    pub fn new(gpu: &Gpu, capacity: usize) -> Result<Self> {
-        Ok(Self { planes: super::channels(gpu, "base warps", capacity)?, capacity })
+    pub fn new(gpu: &Gpu, size: ScratchSize) -> Result<Self> {
+        Ok(Self {
+            planes: super::channels(gpu, "base warps", size.planes)?,
+            copy: super::channels(gpu, "copy with margin", size.copy)?,
+            size,
+        })
     }
 }
 
@@ -130,30 +225,36 @@ pub struct Blur {
     latent: (usize, usize),
     frame: (usize, usize),
     pad: usize,
-    scratch_size: (usize, usize),
-    origin: [i32; 2],
-    bases: usize,
+    support: usize,
+    /// Smallest and largest shift in x and in y.
+    shift_x: (i32, i32),
+    shift_y: (i32, i32),
+    /// Homographies scene to frame, by entry of the base table.
+    homographies: Vec<DMat3>,
+    taps: usize,
+    near: bool,
     reach: i32,
+    direct: bool,
     base_table: wgpu::Buffer,
+    /// None in the direct design.
     chunks: Vec<Chunk>,
 }
 
-/// Appends the runs of consecutive shifts in x of taps sorted by (dy, dx), in the layout of shaders/tap_sum.wgsl.
-fn append_runs(taps: &[(i32, i32, f64)], plane: i32, table: &mut Vec<[i32; 4]>) {
-    for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
-        // Load m is at p - dx with dx descending: weight t[m] belongs to the m-th largest shift.
-        let (dy, dx) = (run[0].0, run[run.len() - 1].1);
-        let blocks = (run.len() + 7).div_ceil(4);
-        table.push([plane, blocks as i32, -dy, -dx]);
-        let weight = |m: usize| run.len().checked_sub(m + 1).map_or(0, |i| (run[i].2 as f32).to_bits() as i32);
-        table.extend((0..blocks).map(|b| std::array::from_fn(|c| weight(4 * b + c))));
-    }
+/// How an operator is cut: frame (or scratch) rows per band, bases per pass.
+#[derive(Clone, Copy, Debug)]
+struct Cut {
+    rows: usize,
+    bases: usize,
 }
 
 /// `vec4i` of a tap table: what 64 KiB, the least that every adapter binds as a uniform, hold.
 const TABLE: usize = 4096;
-/// Taps of one group at most, so that even taps without neighbours (three entries each) fit a table.
-const GROUP_TAPS: usize = 1300;
+/// Taps of one group at most, so that even taps without neighbours (one entry each) fit a table.
+const GROUP_TAPS: usize = 3000;
+/// Zeros around the copy of the latent grid: at least the width of an interpolation.
+const MARGIN: usize = 8;
+/// Zero columns on either side of the adjoint's planes: at least the window of shaders/warp_adjoint_near.wgsl.
+const SIDE: usize = 12;
 
 /// Shifts (dy, dx, weight) of one base warp, sorted.
 type Group = Vec<(i32, i32, f64)>;
@@ -166,122 +267,311 @@ struct Chunk {
     adjoint: wgpu::Buffer,
 }
 
-/// Group index and runs of `groups`, whose first is base warp `first`; the adjoint's taps are mirrored and read the frame.
-fn tap_table(groups: &[Group], first: usize, adjoint: bool) -> Vec<[i32; 4]> {
-    let mut table = vec![[0i32; 4]; (groups.len() + 1).div_ceil(4)];
-    for (g, taps) in groups.iter().enumerate() {
-        table[g / 4][g % 4] = table.len() as i32;
-        if adjoint {
-            let mirrored: Group = taps.iter().rev().map(|t| (-t.0, -t.1, t.2)).collect();
-            append_runs(&mirrored, 0, &mut table);
-        } else {
-            append_runs(taps, (first + g) as i32, &mut table);
-        }
+/// Appends the runs of consecutive places in x of `taps` (y, x, weight), sorted, in the layout of shaders/tap_sum.wgsl.
+fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
+    for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
+        let weight = |m: usize| run.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
+        table.push([run[0].0 * stride as i32 + run[0].1, run.len() as i32, weight(0), weight(1)]);
+        table.extend((2..run.len()).step_by(4).map(|m| std::array::from_fn(|c| weight(m + c))));
     }
-    let (n, end) = (groups.len(), table.len() as i32);
-    table[n / 4][n % 4] = end;
-    table
-}
-
-/// As few chunks as hold all groups.
-fn chunks(gpu: &Gpu, groups: &[Group]) -> Vec<Chunk> {
-    let (mut out, mut first) = (Vec::new(), 0);
-    while first < groups.len() {
-        let mut count = 1;
-        while first + count < groups.len() && tap_table(&groups[first..=first + count], first, false).len() <= TABLE {
-            count += 1;
-        }
-        let table = |adjoint: bool| {
-            let mut t = tap_table(&groups[first..first + count], first, adjoint);
-            t.resize(TABLE, [0; 4]);
-            gpu.uniform("taps", bytemuck::cast_slice(&t))
-        };
-        out.push(Chunk { first, count, forward: table(false), adjoint: table(true) });
-        first += count;
-    }
-    out
 }
 
 impl Blur {
     /// The operator of `taps` from a latent grid, which surrounds the frame by `pad` pixels on every side, to a frame of
-    /// `frame` = (width, height) pixels. Irradiance beyond the latent grid counts as 0.
+    /// `frame` = (width, height) pixels. Irradiance beyond the latent grid counts as 0. Direct when every tap has a base of its own
+    /// and shifts nothing.
     pub fn new(gpu: &Gpu, kernels: &BlurKernels, taps: &TapSet, frame: (usize, usize), pad: usize) -> Self {
         let range = |f: fn(&crate::tsf::Tap) -> i32| taps.taps.iter().map(f).fold((i32::MAX, i32::MIN), |(a, b), v| (a.min(v), b.max(v)));
-        let ((x0, x1), (y0, y1)) = (range(|t| t.dx), range(|t| t.dy));
-        let scratch_size = (frame.0 + (x1 - x0) as usize, frame.1 + (y1 - y0) as usize);
-        let half = DVec2::new(scratch_size.0 as f64, scratch_size.1 as f64) * 0.5;
-        let reach = taps.bases.iter().map(|h| (kernels.support as f64 * spread(h, half) + 0.5).floor() as i32).max().unwrap_or(0);
-        // A base warp with more taps than a table holds stands there several times.
+        let (shift_x, shift_y) = (range(|t| t.dx), range(|t| t.dy));
+        let direct = taps.taps.len() == taps.bases.len() && taps.taps.iter().enumerate().all(|(i, t)| (t.base, t.dx, t.dy) == (i, 0, 0));
+        let half = 0.5 * DVec2::new(frame.0 as f64 + f64::from(shift_x.1 - shift_x.0), frame.1 as f64 + f64::from(shift_y.1 - shift_y.0));
+        let s = kernels.support as f64;
+        let spreads: Vec<(f64, f64)> = taps.bases.iter().map(|h| spread(h, half)).collect();
+        let reach = spreads.iter().map(|d| (s * d.0 + 0.5).floor() as i32).max().unwrap_or(0);
+        // The window's centre is within half a pixel of the target of the middle of four pixels, the targets of each of which lie within
+        // `s` times the row sum of its own; together less than the next whole pixel.
+        let near = spreads.iter().all(|d| s * d.0 + 0.5 + 1.5 * d.1 < s + 0.99);
+        let mut blur = Self {
+            latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
+            frame,
+            pad,
+            support: kernels.support,
+            shift_x,
+            shift_y,
+            homographies: Vec::new(),
+            taps: taps.taps.len(),
+            near,
+            reach,
+            direct,
+            base_table: gpu.table::<BaseTable>("base warps", &[]),
+            chunks: Vec::new(),
+        };
+        // A base warp with more taps than a table holds stands there several times; one without any, not at all.
         let (mut table, mut groups) = (Vec::new(), Vec::new());
         for (b, h) in taps.bases.iter().enumerate() {
             let ((abc, def), (abc_inverse, def_inverse)) = (displacement_table(&h.inverse()), displacement_table(h));
             let mut own: Group = taps.taps.iter().filter(|t| t.base == b).map(|t| (t.dy, t.dx, t.weight)).collect();
             own.sort_by_key(|t| (t.0, t.1));
             for part in own.chunks(GROUP_TAPS) {
-                table.push(BaseTable { abc, def, abc_inverse, def_inverse });
+                let weight = if direct { part[0].2 as f32 } else { 1.0 };
+                table.push(BaseTable { abc, def, abc_inverse, def_inverse, weight: [weight, 0.0, 0.0, 0.0] });
+                blur.homographies.push(*h);
                 groups.push(part.to_vec());
             }
         }
-        Self {
-            latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
-            frame,
-            pad,
-            scratch_size,
-            origin: [-x1, -y1],
-            bases: groups.len(),
-            reach,
-            base_table: gpu.table("base warps", &table),
-            chunks: chunks(gpu, &groups),
+        blur.base_table = gpu.table("base warps", &table);
+        if !direct {
+            blur.chunks = blur.tables(gpu, &groups);
         }
+        blur
     }
 
-    /// Values of scratch per channel that let all base warps run in one pass.
-    pub fn scratch_wanted(&self) -> usize {
-        self.bases * self.scratch_size.0 * self.scratch_size.1
-    }
-
-    /// Values of scratch per channel without which the operator cannot run.
-    pub fn scratch_needed(&self) -> usize {
-        self.scratch_size.0 * self.scratch_size.1
-    }
-
-    /// (tap tables, first base, number of bases) of the passes that the scratch allows.
-    fn passes(&self, scratch: &Scratch) -> Vec<(&Chunk, usize, usize)> {
-        let at_once = (scratch.capacity / self.scratch_needed()).max(1);
-        let of_chunk = |c: &'_ Chunk| (c.first..c.first + c.count).step_by(at_once).map(move |b| (b, at_once)).collect::<Vec<_>>();
-        self.chunks.iter().flat_map(|c| of_chunk(c).into_iter().map(move |(b, n)| (c, b, n.min(c.first + c.count - b)))).collect()
-    }
-
-    fn warp_params(&self, first: usize, bases: usize) -> WarpParams {
-        WarpParams {
-            size: [self.latent.0 as i32, self.latent.1 as i32],
-            scratch_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
-            scratch_origin: self.origin,
-            pad: [self.pad as i32; 2],
-            centre: [(self.frame.0 as f32 - 1.0) / 2.0, (self.frame.1 as f32 - 1.0) / 2.0],
-            first_base: first as u32,
-            bases: bases as u32,
+    /// Group index and runs of `groups`.
+    fn tap_table(&self, groups: &[Group], adjoint: bool) -> Vec<[i32; 4]> {
+        let mut table = vec![[0i32; 4]; (groups.len() + 1).div_ceil(4)];
+        for (g, taps) in groups.iter().enumerate() {
+            table[g / 4][g % 4] = table.len() as i32;
+            // K reads its planes at p - shift, Kᵀ the frame at q + shift; both from the corner that the farthest shift reaches.
+            if adjoint {
+                let places: Group = taps.iter().map(|t| (t.0 - self.shift_y.0, t.1 - self.shift_x.0, t.2)).collect();
+                append_runs(&places, self.copy_width(), &mut table);
+            } else {
+                let places: Group = taps.iter().rev().map(|t| (self.shift_y.1 - t.0, self.shift_x.1 - t.1, t.2)).collect();
+                append_runs(&places, self.width(false), &mut table);
+            }
         }
+        let (n, end) = (groups.len(), table.len() as i32);
+        table[n / 4][n % 4] = end;
+        table
+    }
+
+    /// As few chunks as hold all groups.
+    fn tables(&self, gpu: &Gpu, groups: &[Group]) -> Vec<Chunk> {
+        let (mut out, mut first) = (Vec::new(), 0);
+        while first < groups.len() {
+            let mut count = 1;
+            while first + count < groups.len() && self.tap_table(&groups[first..=first + count], false).len() <= TABLE {
+                count += 1;
+            }
+            let table = |adjoint: bool| {
+                let mut t = self.tap_table(&groups[first..first + count], adjoint);
+                t.resize(TABLE, [0; 4]);
+                gpu.uniform("taps", bytemuck::cast_slice(&t))
+            };
+            out.push(Chunk { first, count, forward: table(false), adjoint: table(true) });
+            first += count;
+        }
+        out
+    }
+
+    /// Columns and rows by which the shifts widen a plane.
+    fn shifts(&self) -> (usize, usize) {
+        ((self.shift_x.1 - self.shift_x.0) as usize, (self.shift_y.1 - self.shift_y.0) as usize)
+    }
+
+    /// Values per row of a plane of base warps. Eight pixels of a row are made at once: the last eight may begin at the last pixel.
+    fn width(&self, adjoint: bool) -> usize {
+        (self.frame.0 + self.shifts().0 + if adjoint { 2 * SIDE } else { 7 }).next_multiple_of(8)
+    }
+
+    /// Values per row of the copy that the adjoint reads.
+    fn copy_width(&self) -> usize {
+        if self.direct { self.frame.0 + 2 * SIDE } else { self.width(true) + self.shifts().0 + 8 }
+    }
+
+    /// Rows of scratch in all: what the shifts make of the frame.
+    fn scratch_rows(&self) -> usize {
+        self.frame.1 + self.shifts().1
+    }
+
+    fn centre(&self) -> DVec2 {
+        DVec2::new(self.frame.0 as f64 - 1.0, self.frame.1 as f64 - 1.0) / 2.0
+    }
+
+    /// Latent rows, as rows of the grid with `margin` more above and below, that K reads for the planes' rows `from..to` (frame pixels).
+    fn latent_rows(&self, from: i32, to: i32, margin: usize) -> Range<i32> {
+        let (c, s) = (self.centre(), self.support as f64);
+        let x = (f64::from(-self.shift_x.1) - c.x - 1.0, f64::from(-self.shift_x.1) + self.width(false) as f64 - c.x);
+        let y = (f64::from(from) - c.y, f64::from(to) - 1.0 - c.y);
+        let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+        for h in &self.homographies {
+            let (a, b) = rows_of(&h.inverse(), x, y).unwrap_or((-1e9, 1e9));
+            (low, high) = (low.min(a), high.max(b));
+        }
+        let (low, high) = (low + c.y + self.pad as f64 - s - 1.0, high + c.y + self.pad as f64 + s + 2.0);
+        let (first, last) = (-(margin as i32), (self.latent.1 + margin) as i32);
+        // Never less than an interpolation's rows: beyond the grid these are the margin, where all is zero.
+        let least = 2 * self.support as i32;
+        let low = (low.floor().max(-1e8) as i32).clamp(first, (last - least).max(first));
+        let high = (high.ceil().min(1e8) as i32).clamp(low.min(last) + least.min(last - low), last);
+        low..high
+    }
+
+    /// Values per channel of the copy that K reads for `rows` rows of the frame, at most.
+    fn forward_copy(&self, rows: usize) -> usize {
+        let bands = (0..self.frame.1).step_by(rows).map(|y| self.forward_band(y, (y + rows).min(self.frame.1)).len());
+        bands.max().unwrap_or(0) * (self.latent.0 + 2 * MARGIN)
+    }
+
+    /// [`Blur::latent_rows`] of the frame's rows `from..to`.
+    fn forward_band(&self, from: usize, to: usize) -> Range<i32> {
+        self.latent_rows(from as i32 - self.shift_y.1, to as i32 - self.shift_y.0, MARGIN)
+    }
+
+    /// Scratch for bands of `rows` rows and `bases` bases at once.
+    fn scratch_for(&self, cut: Cut) -> ScratchSize {
+        let shifts = self.shifts().1;
+        let copy = self.forward_copy(cut.rows).max((cut.rows + shifts) * self.copy_width());
+        if self.direct {
+            return ScratchSize { planes: 0, copy };
+        }
+        ScratchSize { planes: cut.bases * ((cut.rows + shifts) * self.width(false)).max(cut.rows * self.width(true)), copy }
+    }
+
+    /// Scratch that lets the operator run in one pass.
+    pub fn scratch_wanted(&self) -> ScratchSize {
+        self.scratch_for(Cut { rows: self.scratch_rows(), bases: self.homographies.len() })
+    }
+
+    /// Scratch without which the operator cannot run.
+    pub fn scratch_needed(&self) -> ScratchSize {
+        self.scratch_for(Cut { rows: 1, bases: 1 })
+    }
+
+    /// Bands and passes that scratch, bindings and the time of a dispatch allow.
+    fn cut(&self, gpu: &Gpu, scratch: &Scratch) -> Cut {
+        let all = self.homographies.len();
+        let width = self.width(true).max(self.latent.0);
+        // A base costs its warp or its taps, whichever dispatch takes longer.
+        let cost = (self.taps as f64 / all as f64).max(crate::tsf::WARP_COST * (2 * self.support).pow(2) as f64) * width as f64;
+        let budget = gpu.dispatch_budget / cost;
+        // Shifts make neighbouring bands compute the same rows twice: rather fewer bases at once than low bands.
+        let least = (2 * self.shifts().1 + 64).min(self.scratch_rows());
+        let rows = ((budget / all as f64) as usize).clamp(least, self.scratch_rows());
+        let mut cut = Cut { rows, bases: ((budget / rows as f64) as usize).clamp(1, all) };
+        let fits = |cut: Cut| {
+            let need = self.scratch_for(cut);
+            need.planes <= scratch.size.planes.min(gpu.max_binding())
+                && need.copy <= scratch.size.copy.min(gpu.max_binding())
+                && gpu.rows_fit(self.forward_copy(cut.rows) / (self.latent.0 + 2 * MARGIN), self.latent)
+                && gpu.rows_fit(self.adjoint_rows(cut.rows), self.latent)
+                && gpu.rows_fit(cut.rows + self.shifts().1, self.frame)
+        };
+        while !fits(cut) && (cut.bases > 1 || cut.rows > 1) {
+            if cut.bases > 1 && (cut.rows <= least || cut.bases > all / 2) {
+                cut.bases = cut.bases.div_ceil(2);
+            } else {
+                cut.rows = cut.rows.div_ceil(2);
+            }
+        }
+        cut
+    }
+
+    /// Most latent rows that a band of `rows` scratch rows adds to.
+    fn adjoint_rows(&self, rows: usize) -> usize {
+        (0..self.scratch_rows()).step_by(rows).map(|y| self.adjoint_band(y, (y + rows).min(self.scratch_rows())).len()).max().unwrap_or(0)
+    }
+
+    /// Latent rows that the scratch rows `from..to` add to.
+    fn adjoint_band(&self, from: usize, to: usize) -> Range<i32> {
+        let first = -self.shift_y.1;
+        self.latent_rows(first + from as i32, first + to as i32, 0)
+    }
+
+    /// (tap table, first base, number of bases) of the passes that do `at_once` bases each.
+    fn passes(&self, at_once: usize) -> Vec<(Option<&Chunk>, usize, usize)> {
+        let parts = |first: usize, end: usize| (first..end).step_by(at_once).map(move |b| (b, at_once.min(end - b)));
+        if self.direct {
+            return parts(0, self.homographies.len()).map(|(b, n)| (None, b, n)).collect();
+        }
+        self.chunks.iter().flat_map(|c| parts(c.first, c.first + c.count).map(move |(b, n)| (Some(c), b, n))).collect()
+    }
+
+    /// Copies the rows `rows` of `from` (an image of `size`) and the columns from `first` on, `width` of them, into the scratch.
+    fn copy(
+        &self,
+        gpu: &Gpu,
+        kernels: &BlurKernels,
+        scratch: &Scratch,
+        from: &Channels,
+        size: (usize, usize),
+        first: i32,
+        width: usize,
+        rows: &Range<i32>,
+    ) -> Step {
+        let inside = rows.start.clamp(0, size.1 as i32) as usize..rows.end.clamp(0, size.1 as i32) as usize;
+        let bound = from.each_ref().map(|b| gpu.rows(b, size.0, inside.clone()));
+        let params = PaddedParams {
+            in_size: [size.0 as i32, size.1 as i32],
+            out_size: [width as i32, rows.len() as i32],
+            origin: [first, rows.start],
+            in_first: bound[0].first as i32,
+            _pad: 0,
+        };
+        let [r, g, b] = bound.map(|b| b.binding);
+        let [x, y, z] = scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
+        kernels.padded.step_parts(gpu, &params, &[r, g, b, x, y, z], [width.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1])
     }
 
     /// Steps of `frame = K latent`.
     pub fn forward(&self, gpu: &Gpu, kernels: &BlurKernels, scratch: &Scratch, latent: &Channels, frame: &Channels) -> Vec<Step> {
+        let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();
-        for (chunk, first, n) in self.passes(scratch) {
-            let s = &scratch.planes;
-            let buffers = [&self.base_table, &latent[0], &latent[1], &latent[2], &s[0], &s[1], &s[2]];
-            steps.push(kernels.warp.step_2d(gpu, &self.warp_params(first, n), &buffers, self.scratch_size, n));
-            let params = TapParams {
-                in_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
-                out_size: [self.frame.0 as i32, self.frame.1 as i32],
-                origin: [-self.origin[0], -self.origin[1]],
-                accumulate: u32::from(first > 0),
-                first_group: (first - chunk.first) as u32,
-                span: n as u32,
-                first_plane: first as u32,
-            };
-            let buffers = [&chunk.forward, &s[0], &s[1], &s[2], &frame[0], &frame[1], &frame[2]];
-            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.frame.0.div_ceil(8), self.frame.1), 1));
+        for from in (0..self.frame.1).step_by(cut.rows) {
+            let to = (from + cut.rows).min(self.frame.1);
+            let rows = self.forward_band(from, to);
+            let copy_width = self.latent.0 + 2 * MARGIN;
+            steps.push(self.copy(gpu, kernels, scratch, latent, self.latent, -(MARGIN as i32), copy_width, &rows));
+            let target = frame.each_ref().map(|b| gpu.rows(b, self.frame.0, from..to));
+            let out_first = (from - target[0].first) as i32;
+            let target = target.map(|b| b.binding);
+            let copy = scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
+            for (chunk, first, n) in self.passes(cut.bases) {
+                let (width, height) = (self.width(false), to - from + self.shifts().1);
+                let mut params = WarpParams {
+                    in_size: [copy_width as i32, rows.len() as i32],
+                    offset: [(self.pad + MARGIN) as i32, self.pad as i32 - rows.start],
+                    out_size: [width as i32, height as i32],
+                    out_origin: [-self.shift_x.1, from as i32 - self.shift_y.1],
+                    centre: [(self.frame.0 as f32 - 1.0) / 2.0, (self.frame.1 as f32 - 1.0) / 2.0],
+                    out_first: 0,
+                    first_base: first as u32,
+                    span: 1,
+                    accumulate: 0,
+                    _pad: [0; 2],
+                };
+                let mut warp = |params: &WarpParams, out: [wgpu::BufferBinding; 3], depth: usize| {
+                    let table = self.base_table.as_entire_buffer_binding();
+                    let [a, b, c] = copy.clone();
+                    let [x, y, z] = out;
+                    let groups = [(params.out_size[0] as u32).div_ceil(64), (params.out_size[1] as u32).div_ceil(8), depth as u32];
+                    steps.push(kernels.warp.step_parts(gpu, params, &[table, a, b, c, x, y, z], groups));
+                };
+                let Some(chunk) = chunk else {
+                    params.out_size = [self.frame.0 as i32, (to - from) as i32];
+                    params.out_origin = [0, from as i32];
+                    params.out_first = out_first;
+                    params.span = n as u32;
+                    params.accumulate = u32::from(first > 0);
+                    warp(&params, target.clone(), 1);
+                    continue;
+                };
+                let planes = || scratch.planes.each_ref().map(|b| b.as_entire_buffer_binding());
+                warp(&params, planes(), n);
+                let params = TapParams {
+                    out_size: [self.frame.0 as i32, (to - from) as i32],
+                    in_stride: width as i32,
+                    in_plane: (width * height) as i32,
+                    first_group: (first - chunk.first) as u32,
+                    span: n as u32,
+                    accumulate: u32::from(first > 0),
+                    out_first,
+                };
+                let ([a, b, c], [x, y, z]) = (planes(), target.clone());
+                let parts = [chunk.forward.as_entire_buffer_binding(), a, b, c, x, y, z];
+                let groups = [self.frame.0.div_ceil(128) as u32, (to - from).div_ceil(8) as u32, 1];
+                steps.push(kernels.tap_sum.step_parts(gpu, &params, &parts, groups));
+            }
         }
         steps
     }
@@ -296,23 +586,66 @@ impl Blur {
         latent: &Channels,
         factor: f32,
     ) -> Vec<Step> {
+        let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();
-        for (chunk, first, n) in self.passes(scratch) {
-            let s = &scratch.planes;
-            let params = TapParams {
-                in_size: [self.frame.0 as i32, self.frame.1 as i32],
-                out_size: [self.scratch_size.0 as i32, self.scratch_size.1 as i32],
-                origin: self.origin,
-                accumulate: 0,
-                first_group: (first - chunk.first) as u32,
-                span: 1,
-                first_plane: 0,
-            };
-            let buffers = [&chunk.adjoint, &frame[0], &frame[1], &frame[2], &s[0], &s[1], &s[2]];
-            steps.push(kernels.tap_sum.step_2d(gpu, &params, &buffers, (self.scratch_size.0.div_ceil(8), self.scratch_size.1), n));
-            let params = WarpAdjointParams { warp: self.warp_params(first, n), reach: self.reach, factor };
-            let buffers = [&self.base_table, &s[0], &s[1], &s[2], &latent[0], &latent[1], &latent[2]];
-            steps.push(kernels.warp_adjoint.step_2d(gpu, &params, &buffers, self.latent, 1));
+        let copy_width = self.copy_width();
+        // Frame row of the first scratch row, and frame column of the planes' first column.
+        let (top, left) = (-self.shift_y.1, -self.shift_x.1 - SIDE as i32);
+        for from in (0..self.scratch_rows()).step_by(cut.rows) {
+            let to = (from + cut.rows).min(self.scratch_rows());
+            let rows = self.adjoint_band(from, to);
+            if rows.is_empty() {
+                continue;
+            }
+            let read = top + from as i32 + self.shift_y.0..top + to as i32 + self.shift_y.1;
+            steps.push(self.copy(gpu, kernels, scratch, frame, self.frame, left + self.shift_x.0, copy_width, &read));
+            let target = latent.each_ref().map(|b| gpu.rows(b, self.latent.0, rows.start as usize..rows.end as usize));
+            let out_first = target[0].first as i32;
+            let target = target.map(|b| b.binding);
+            let copy = || scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
+            let planes = || scratch.planes.each_ref().map(|b| b.as_entire_buffer_binding());
+            for (chunk, first, n) in self.passes(cut.bases) {
+                let (width, height) = (self.width(true), to - from);
+                let mut params = WarpAdjointParams {
+                    size: [self.latent.0 as i32, self.latent.1 as i32],
+                    in_size: [width as i32, height as i32],
+                    in_origin: [left, top + from as i32],
+                    pad: [self.pad as i32; 2],
+                    centre: [(self.frame.0 as f32 - 1.0) / 2.0, (self.frame.1 as f32 - 1.0) / 2.0],
+                    rows: [rows.start, rows.end],
+                    out_first,
+                    plane: (width * height) as u32,
+                    first_base: first as u32,
+                    bases: n as u32,
+                    reach: self.reach,
+                    factor,
+                };
+                let source = if let Some(chunk) = chunk {
+                    let params = TapParams {
+                        out_size: [width as i32, height as i32],
+                        in_stride: copy_width as i32,
+                        in_plane: 0,
+                        first_group: (first - chunk.first) as u32,
+                        span: 1,
+                        accumulate: 0,
+                        out_first: 0,
+                    };
+                    let ([a, b, c], [x, y, z]) = (copy(), planes());
+                    let parts = [chunk.adjoint.as_entire_buffer_binding(), a, b, c, x, y, z];
+                    let groups = [width.div_ceil(128) as u32, height.div_ceil(8) as u32, n as u32];
+                    steps.push(kernels.tap_sum.step_parts(gpu, &params, &parts, groups));
+                    planes()
+                } else {
+                    params.in_size[0] = copy_width as i32;
+                    params.plane = 0;
+                    copy()
+                };
+                let (kernel, wide) = if self.near { (&kernels.warp_adjoint_near, 64) } else { (&kernels.warp_adjoint, 16) };
+                let ([a, b, c], [x, y, z]) = (source, target.clone());
+                let parts = [self.base_table.as_entire_buffer_binding(), a, b, c, x, y, z];
+                let groups = [self.latent.0.div_ceil(wide) as u32, rows.len().div_ceil(8) as u32, 1];
+                steps.push(kernel.step_parts(gpu, &params, &parts, groups));
+            }
         }
         steps
     }

@@ -4,7 +4,7 @@ mod blur;
 mod data;
 mod linear;
 
-pub use blur::{Blur, BlurKernels, Scratch};
+pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
 pub use data::{DataKernels, MisfitSource, NOISE_STEPS, WeightTarget};
 pub use linear::{LinearKernels, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, partials_1d, partials_2d};
 
@@ -52,8 +52,10 @@ impl Kernels {
 
 /// Every shader of the program as (name, whole source), for validation without a GPU.
 pub const SHADERS: &[(&str, &str)] = &[
+    ("padded", blur::PADDED),
     ("warp", blur::WARP),
     ("warp_adjoint", blur::WARP_ADJOINT),
+    ("warp_adjoint_near", blur::WARP_ADJOINT_NEAR),
     ("tap_sum", blur::TAP_SUM),
     ("weights", data::WEIGHTS),
     ("misfit", data::MISFIT),

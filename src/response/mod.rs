@@ -4,12 +4,14 @@ mod automatic;
 mod calibrate;
 mod file;
 mod mitsunaga;
+mod reduce;
 mod shades;
 
 pub use automatic::{Automatic, DISAGREEMENT_EV, ExposureCheck, automatic, check_exposures};
 pub use calibrate::calibrate;
 pub use file::{InverseTables, Provenance, ResponseFile};
 pub use mitsunaga::{Polynomial, mitsunaga};
+pub use reduce::reduced;
 
 use crate::error::{Error, Result};
 

@@ -11,13 +11,14 @@ mod whole_frame;
 pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
 pub use model::Model;
-pub use taps::{Interpolation, Tap, TapSet};
+pub use taps::{INDISTINGUISHABLE, Interpolation, Tap, TapSet, WARP_COST};
 pub use whole_frame::WholeFrame;
 
 use crate::error::{Error, Result};
 use crate::pose::Pose;
-use glam::DMat3;
+use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// The TSF h_T of one frame: sparse poses whose weights sum to 1.
 #[derive(Clone, Debug, PartialEq)]
@@ -86,6 +87,39 @@ impl Tsf {
     /// Motion of the mean pose (frame from reference, centred pixels).
     pub fn centre(&self) -> DMat3 {
         self.mean().homography(self.focal_px) * self.base
+    }
+
+    /// The same with poses that no pixel of a `width` x `height` frame tells apart made one, their weighted mean: wherever a pose takes a
+    /// pixel of the frame, a pose of the result stands within `bound` pixels of it with its weight. One pass, whatever the poses' order.
+    pub fn merged(&self, width: usize, height: usize, bound: f64) -> Self {
+        let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+        let corners = [(-x, -y), (x, -y), (-x, y), (x, y)].map(|c| DVec2::new(c.0, c.1));
+        // Cells whose diagonal is the bound; a small homography moves no pixel farther than the corner that moves farthest.
+        let side = bound / std::f64::consts::SQRT_2;
+        let mut cells: BTreeMap<[i64; 8], Pose> = BTreeMap::new();
+        for p in &self.poses {
+            let moved = corners.map(|c| p.apply(self.focal_px, c) - c);
+            let key = std::array::from_fn(|i| ((if i % 2 == 0 { moved[i / 2].x } else { moved[i / 2].y }) / side).floor() as i64);
+            let cell = cells.entry(key).or_insert(Pose { weight: 0.0, ..*p });
+            let sum = cell.weight + p.weight;
+            let mean = |a: f64, b: f64| a + (b - a) * (p.weight / sum);
+            *cell = Pose {
+                t_x: mean(cell.t_x, p.t_x),
+                t_y: mean(cell.t_y, p.t_y),
+                theta_x_deg: mean(cell.theta_x_deg, p.theta_x_deg),
+                theta_y_deg: mean(cell.theta_y_deg, p.theta_y_deg),
+                theta_z_deg: mean(cell.theta_z_deg, p.theta_z_deg),
+                weight: sum,
+            };
+        }
+        Self { poses: cells.into_values().collect(), ..self.clone() }
+    }
+
+    /// The same motion on frames `factor` times as large.
+    pub fn scaled(&self, factor: f64) -> Self {
+        let poses = self.poses.iter().map(|p| Pose { t_x: factor * p.t_x, t_y: factor * p.t_y, ..*p }).collect();
+        let larger = DMat3::from_diagonal(DVec3::new(factor, factor, 1.0));
+        Self { focal_px: factor * self.focal_px, poses, base: larger * self.base * larger.inverse() }
     }
 
     /// Weighted mean pose: (t_x, t_y) in pixels, (θ_x, θ_y, θ_z) in degrees.
@@ -181,6 +215,31 @@ impl TsfFile {
         if !sound {
             return Err(Error::Input(format!("TSF of {name}: its base is no homography that can be undone")));
         }
-        Tsf::new(e.focal_px, e.poses.clone()).map(|t| Some(t.about(base))).map_err(|x| Error::Input(format!("TSF of {name}: {x}")))
+        let tsf = Tsf::new(e.focal_px, e.poses.clone()).map_err(|x| Error::Input(format!("TSF of {name}: {x}")))?;
+        for pose in &tsf.poses {
+            // Where the frame's centre goes: a pose that shows nothing of the frame is a mistake in units or sign.
+            let centre = pose.apply(tsf.focal_px, DVec2::ZERO);
+            if !(centre.x.abs() < width as f64 && centre.y.abs() < height as f64) {
+                return Err(Error::Input(format!(
+                    "TSF of {name}: pose {pose:?} moves the whole frame out of view; translations are pixels, angles degrees"
+                )));
+            }
+        }
+        Ok(Some(tsf.about(base)))
+    }
+
+    /// The same motions on frames whose sides are divided by `divisor` (and rounded down).
+    pub fn reduced(&self, divisor: usize) -> Self {
+        let factor = 1.0 / divisor as f64;
+        let frames = self.frames.iter().map(|e| TsfEntry {
+            width: e.width / divisor,
+            height: e.height / divisor,
+            focal_px: e.focal_px * factor,
+            poses: e.poses.iter().map(|p| Pose { t_x: factor * p.t_x, t_y: factor * p.t_y, ..*p }).collect(),
+            // In pixels: the third column grows with the frame, the third row shrinks.
+            base: e.base.map(|[[a, b, c], [d, f, g], [h, i, j]]| [[a, b, c * factor], [d, f, g * factor], [h / factor, i / factor, j]]),
+            ..e.clone()
+        });
+        Self::new(frames.collect())
     }
 }

@@ -25,7 +25,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
-    ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet"]),
+    ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
     ("deblur", &["error", "image", "pose", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
     // All stages in order. Of the kernels it only opens the set.
     (
@@ -70,6 +70,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "tonemap",
             "synth",
             "gpu::list_adapters",
+            "tsf::Interpolation",
             "tsf::Model",
             "tsf::Tsf",
             "tsf::TsfEntry",

@@ -26,6 +26,8 @@ mod metrics;
 mod register;
 /// Response: calibration against truth and against OpenCV, response files.
 mod response;
+/// Memory, reduced size, refused input.
+mod scale;
 /// What naga says of the shaders, without a GPU.
 mod shaders;
 /// The solver against dense algebra, and what it promises.

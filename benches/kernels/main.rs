@@ -1,0 +1,182 @@
+//! `cargo bench --bench kernels`: K, Kᵀ and an iteration of the conjugate gradients on a fixed workload, beside a CPU version of the
+//! same algorithm. The table at the end alternates between them in one run: on a machine that others use only its ratios mean something.
+
+mod rotate_shift;
+
+use criterion::Criterion;
+use rotate_shift::RotateShift;
+use std::time::Instant;
+use unshaken::deblur::{self, Observation, Settings};
+use unshaken::gpu::{Gpu, Step, read};
+use unshaken::image::{Plane, Rgb};
+use unshaken::kernels::{Blur, Channels, Kernels, NOISE_STEPS, Scratch, channels};
+use unshaken::pose::Pose;
+use unshaken::tsf::{Interpolation, Tap, TapSet, Tsf};
+
+/// Side of the workload's square frame, pixels.
+const SIDE: usize = 1024;
+
+/// 64 poses: 13 angles 1/4 degree apart, about 5 whole-pixel shifts of a random walk at each.
+fn workload() -> TapSet {
+    let mut state = 1u32;
+    let mut next = |n: u32| {
+        state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+        ((state >> 16) % n) as i32
+    };
+    let (mut taps, mut x, mut y) = (Vec::new(), 0, 0);
+    for base in 0..13 {
+        let count = if base == 6 { 4 } else { 5 };
+        let mut at = std::collections::BTreeSet::new();
+        while at.len() < count {
+            at.insert((y, x));
+            x = (x + next(3) - 1).clamp(-12, 12);
+            y = (y + next(3) - 1).clamp(-12, 12);
+        }
+        taps.extend(at.into_iter().map(|(dy, dx)| Tap { base, dx, dy, weight: 1.0 / 64.0 }));
+    }
+    let bases = (-6..=6).map(|k| Pose::planar(0.0, 0.0, 0.25 * f64::from(k), 1.0).rotation(1000.0)).collect();
+    TapSet { bases, taps }
+}
+
+struct Device {
+    gpu: Gpu,
+    frame: Channels,
+    back: Channels,
+    forward: Vec<Step>,
+    adjoint: Vec<Step>,
+}
+
+fn noise(seed: u32) -> Vec<f32> {
+    let mut state = seed;
+    (0..SIDE * SIDE)
+        .map(|_| {
+            state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+            (state >> 8) as f32 / (1u32 << 24) as f32
+        })
+        .collect()
+}
+
+impl Device {
+    fn new(taps: &TapSet, image: &[Vec<f32>; 3]) -> Self {
+        let gpu = Gpu::new().expect("an adapter");
+        let kernels = Kernels::new(&gpu, Interpolation::Bilinear);
+        let blur = Blur::new(&gpu, &kernels.blur, taps, (SIDE, SIDE), 0);
+        let scratch = Scratch::new(&gpu, blur.scratch_wanted()).expect("memory");
+        let latent = image.each_ref().map(|c| gpu.upload("latent", c).expect("memory"));
+        let frame = channels(&gpu, "frame", SIDE * SIDE).expect("memory");
+        let back = channels(&gpu, "back", SIDE * SIDE).expect("memory");
+        let forward = blur.forward(&gpu, &kernels.blur, &scratch, &latent, &frame);
+        let adjoint = blur.adjoint(&gpu, &kernels.blur, &scratch, &latent, &back, 1.0);
+        Self { gpu, frame, back, forward, adjoint }
+    }
+
+    fn run(&self, steps: &[Step]) {
+        self.gpu.submit(steps);
+        read(&self.gpu, &self.frame[0], 1).expect("the device answers");
+    }
+}
+
+/// Milliseconds that `f` keeps one processor busy, over the number of processors: what it takes when nobody else uses them. Elapsed time
+/// where the system does not tell.
+fn time(f: impl FnOnce()) -> f64 {
+    let (start, busy) = (Instant::now(), processor_time());
+    f();
+    match (busy, processor_time()) {
+        (Some(a), Some(b)) => (b - a) * 1000.0 / rayon::current_num_threads() as f64,
+        _ => start.elapsed().as_secs_f64() * 1000.0,
+    }
+}
+
+/// Seconds that the process' threads have run.
+fn processor_time() -> Option<f64> {
+    let mut nanoseconds = 0u64;
+    for task in std::fs::read_dir("/proc/self/task").ok()? {
+        let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
+        nanoseconds += text.split(' ').next()?.parse::<u64>().ok()?;
+    }
+    Some(nanoseconds as f64 * 1e-9)
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// One shaken frame under the workload's motion, and a flat start.
+fn observation(taps: &TapSet, image: &[Vec<f32>; 3]) -> (Observation, Rgb) {
+    let plane = |c: usize| Plane::from_vec(SIDE, SIDE, image[c].iter().map(|v| 0.1 + 0.8 * v).collect()).expect("the frame's size");
+    let poses = taps.taps.iter().map(|t| {
+        let angle = 0.25 * (t.base as f64 - 6.0);
+        Pose::planar(f64::from(t.dx), f64::from(t.dy), angle, t.weight)
+    });
+    let observation = Observation {
+        exposure: Rgb([plane(0), plane(1), plane(2)]),
+        mask: Plane::filled(SIDE, SIDE, 1.0),
+        exposure_time: 1.0,
+        noise: std::array::from_fn(|_| vec![0.02; NOISE_STEPS]),
+        black_clipped: false,
+        tsf: Tsf::new(1000.0, poses.collect()).expect("a motion"),
+    };
+    (observation, Rgb::filled(SIDE, SIDE, 0.5))
+}
+
+fn main() {
+    let taps = workload();
+    let image = [noise(1), noise(2), noise(3)];
+    let device = Device::new(&taps, &image);
+    let cpu = RotateShift::new(&taps, SIDE, SIDE);
+    let mut out = image.clone();
+    println!(
+        "{}, {} threads; K and its adjoint, {SIDE} x {SIDE} pixels, 3 channels, 64 poses",
+        device.gpu.description,
+        rayon::current_num_threads()
+    );
+
+    // Both must compute the same before their times compare.
+    let same = |what: &str, buffer: &wgpu::Buffer, expected: &[f32]| {
+        let got = read(&device.gpu, buffer, SIDE * SIDE).expect("the device answers");
+        let worst = got.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-4, "{what}: the two differ by {worst}");
+    };
+    device.run(&device.forward);
+    cpu.forward(&image, &mut out);
+    same("K", &device.frame[0], &out[0]);
+    device.run(&device.adjoint);
+    cpu.adjoint(&image, &mut out);
+    same("adjoint of K", &device.back[0], &out[0]);
+
+    let rounds: usize = std::env::var("ROUNDS").ok().and_then(|v| v.parse().ok()).unwrap_or(9);
+    let mut times: [Vec<f64>; 4] = Default::default();
+    for _ in 0..rounds {
+        times[0].push(time(|| device.run(&device.forward)));
+        times[1].push(time(|| cpu.forward(&image, &mut out)));
+        times[2].push(time(|| device.run(&device.adjoint)));
+        times[3].push(time(|| cpu.adjoint(&image, &mut out)));
+    }
+    let [k, k_cpu, t, t_cpu] = times.each_mut().map(|r| median(r));
+    println!("| | device, ms | CPU, ms | ratio |\n|---|---|---|---|");
+    println!("| K | {k:.0} | {k_cpu:.0} | {:.2} |\n| adjoint of K | {t:.0} | {t_cpu:.0} | {:.2} |", k / k_cpu, t / t_cpu);
+
+    // An iteration: the difference between long and short solves.
+    let (observation, start) = observation(&taps, &image);
+    let kernels = Kernels::new(&device.gpu, Interpolation::Bilinear);
+    let solve = |inner: usize| {
+        let settings = Settings { outer: 1, inner, ..Settings::default() };
+        time(|| drop(deblur::solve(&device.gpu, &kernels, std::slice::from_ref(&observation), &start, 0, &settings, &mut |_| true)))
+    };
+    let mut differences: Vec<f64> = (0..rounds.div_ceil(4)).map(|_| (solve(7) - solve(2)) / 5.0).collect();
+    let iteration = median(&mut differences);
+    println!(
+        "An iteration of the conjugate gradients: {iteration:.0} ms; beside K and its adjoint {:.1} %",
+        100.0 * (iteration / (k + t) - 1.0)
+    );
+
+    let mut criterion = Criterion::default().sample_size(10).configure_from_args();
+    let mut group = criterion.benchmark_group("64 poses");
+    group.bench_function("K, device", |b| b.iter(|| device.run(&device.forward)));
+    group.bench_function("K, CPU", |b| b.iter(|| cpu.forward(&image, &mut out)));
+    group.bench_function("adjoint, device", |b| b.iter(|| device.run(&device.adjoint)));
+    group.bench_function("adjoint, CPU", |b| b.iter(|| cpu.adjoint(&image, &mut out)));
+    group.finish();
+    criterion.final_summary();
+}
