@@ -14,7 +14,7 @@ use crate::psf;
 use crate::register::{self, Registrar, Registration};
 use crate::response::Response;
 use crate::triage::{self, Verdict};
-use crate::tsf::{self, Interpolation, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
+use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 use std::time::Instant;
@@ -40,9 +40,6 @@ pub struct Settings {
     pub patches: Vec<(usize, usize)>,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
-    /// Interpolation of the warps; `None`: bilinear where a sharp frame holds the irradiance in place, bicubic where none does and
-    /// the warps' own blur would be sharpened away twice. Takes the place of that in `deblur`.
-    pub interpolation: Option<Interpolation>,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
@@ -59,7 +56,6 @@ impl Default for Settings {
             focal_px: None,
             patches: Vec::new(),
             noise: None,
-            interpolation: None,
             deblur: deblur::Settings::default(),
         }
     }
@@ -149,15 +145,12 @@ pub fn merge(
     let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
     let motions = vec![DMat3::IDENTITY; frames.len()];
     let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
-    let mut settings = settings.clone();
-    settings.deblur.interpolation =
-        settings.interpolation.unwrap_or(if verdicts.iter().any(|v| v.sharp) { Interpolation::Bilinear } else { Interpolation::Bicubic });
     let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let mut run = Run {
         gpu,
         kernels,
         bracket,
-        settings: &settings,
+        settings,
         exposures,
         masks: Vec::new(),
         noise,

@@ -69,9 +69,9 @@ pub(super) struct MergeArgs {
     /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
-    /// Interpolation of the warps [default: bilinear; bicubic where no frame is sharp]
-    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"])]
-    pub interpolation: Option<String>,
+    /// Interpolation of the warps
+    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
+    pub interpolation: String,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,

@@ -122,11 +122,11 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         settings.patches.push(pixel.ok_or_else(|| Usage(format!("--patch: {word:?} is not a pixel such as 120,80")))?);
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
-    settings.interpolation = args.interpolation.as_deref().map(|word| match word {
+    settings.deblur.interpolation = match args.interpolation.as_str() {
         "bicubic" => Interpolation::Bicubic,
         "six-point" => Interpolation::SixPoint,
         _ => Interpolation::Bilinear,
-    });
+    };
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
