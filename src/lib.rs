@@ -16,6 +16,7 @@ pub mod baseline;
 pub mod cli;
 pub mod deblur;
 pub mod error;
+pub mod experiments;
 pub mod exposure;
 mod fft;
 pub mod gpu;

@@ -35,6 +35,14 @@ pub fn preview(irradiance: &Rgb) -> image::RgbImage {
     ToneMap::fit(irradiance).apply(irradiance)
 }
 
+/// What is a picture already: values 0..=1 as 8-bit codes, without any curve.
+pub fn codes(intensity: &Rgb) -> image::RgbImage {
+    let (width, height) = intensity.size();
+    image::RgbImage::from_fn(width as u32, height as u32, |x, y| {
+        image::Rgb(intensity.pixel(y as usize * width + x as usize).map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8))
+    })
+}
+
 impl ToneMap {
     /// Chooses exposure and compression for `irradiance`.
     pub fn fit(irradiance: &Rgb) -> Self {

@@ -19,6 +19,14 @@ pub(super) enum Command {
     Calibrate(CalibrateArgs),
     /// Make a shaken bracket, reconstruct it, and show what was gained
     Demo(DemoArgs),
+    /// Make a hand-held bracket with known truth from a scene
+    Synth(Box<super::synth::SynthArgs>),
+    /// Judge results against the truth, or pictures by their sharpness
+    Compare(super::compare::CompareArgs),
+    /// Merge a bracket by what one would do instead, and judge all beside each other
+    Baseline(super::baseline::BaselineArgs),
+    /// Repeat the experiments of the paper: tables and pictures
+    Experiment(super::experiment::ExperimentArgs),
     /// List the GPU adapters and the one that would be used
     Adapters,
 }

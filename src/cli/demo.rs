@@ -9,7 +9,7 @@ use crate::metrics::{Judge, Score, score};
 use crate::pipeline::{self, Event, Settings};
 use crate::response::Response;
 use crate::synth::{self, Camera, SyntheticBracket, Tremor, font};
-use crate::tonemap::ToneMap;
+use crate::tonemap::{self, ToneMap};
 use crate::tsf::{TsfEntry, TsfFile};
 use anyhow::Context;
 use image::{RgbImage, imageops};
@@ -93,7 +93,7 @@ pub fn run(output_dir: &Path, events: &mut dyn FnMut(Event) -> bool) -> anyhow::
         targets.true_tsfs.stage_json(&true_tsfs(&synthetic))?,
     ];
     for (frame, target) in frames.iter().zip(&targets.frames) {
-        staged.push(target.stage_png(&codes(frame))?);
+        staged.push(target.stage_png(&tonemap::codes(&frame.intensity))?);
     }
     for file in staged {
         file.commit()?;
@@ -196,7 +196,7 @@ pub fn comparison(columns: &[(&str, &Rgb)], map: &ToneMap) -> RgbImage {
     let mut out = RgbImage::from_pixel(width, height, image::Rgb([24, 24, 26]));
     for (i, (label, image)) in columns.iter().enumerate() {
         let x = GAP + i as u32 * (CELL.0 + GAP);
-        write_text(&mut out, label, x as f32 + 2.0, GAP as f32, LABEL as f32);
+        font::write(&mut out, label, x as f32 + 2.0, GAP as f32, LABEL as f32);
         let picture = map.apply(image);
         let whole = imageops::resize(&picture, CELL.0, CELL.1, imageops::FilterType::CatmullRom);
         imageops::replace(&mut out, &whole, i64::from(x), i64::from(top));
@@ -207,29 +207,4 @@ pub fn comparison(columns: &[(&str, &Rgb)], map: &ToneMap) -> RgbImage {
         }
     }
     out
-}
-
-/// Light text on dark ground; upper left corner at (x, y).
-fn write_text(image: &mut RgbImage, text: &str, x: f32, y: f32, height: f32) {
-    let radius = 0.07 * height;
-    for [a, b] in font::segments(text, height) {
-        let (a, b) = ((a.0 + x, a.1 + y), (b.0 + x, b.1 + y));
-        let range = |p: f32, q: f32, n: u32| ((p.min(q) - 2.0).max(0.0) as u32, ((p.max(q) + 3.0) as u32).min(n));
-        let ((x0, x1), (y0, y1)) = (range(a.0, b.0, image.width()), range(a.1, b.1, image.height()));
-        for v in y0..y1 {
-            for u in x0..x1 {
-                let cover = (radius + 0.5 - font::distance([a, b], u as f32, v as f32)).clamp(0.0, 1.0);
-                let pixel = &mut image.get_pixel_mut(u, v).0;
-                *pixel = pixel.map(|c| c.max((235.0 * cover) as u8));
-            }
-        }
-    }
-}
-
-/// The frame's 8-bit codes.
-fn codes(frame: &Frame) -> RgbImage {
-    let (width, height) = frame.intensity.size();
-    RgbImage::from_fn(width as u32, height as u32, |x, y| {
-        image::Rgb(frame.intensity.pixel(y as usize * width + x as usize).map(|v| (v * 255.0).round() as u8))
-    })
 }

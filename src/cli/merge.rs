@@ -176,7 +176,7 @@ fn frame_number(option: &str, word: &str, frames: usize) -> Result<usize, Usage>
     }
 }
 
-fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, Usage> {
+pub(super) fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, Usage> {
     let mut indices = Vec::new();
     for word in list.split(',') {
         let i = frame_number(option, word, frames)?;
@@ -215,7 +215,7 @@ fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Ou
     Ok((check(&args.output)?, args.preview.as_ref().map(check).transpose()?, args.report.as_ref().map(check).transpose()?))
 }
 
-fn read_response(path: &Path) -> Result<Response, Error> {
+pub(super) fn read_response(path: &Path) -> Result<Response, Error> {
     if !path.exists() {
         let reason = "is neither auto, srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
         return Err(Error::Format { path: path.into(), reason });
@@ -224,7 +224,7 @@ fn read_response(path: &Path) -> Result<Response, Error> {
     ResponseFile::parse(&text).map(|f| f.response()).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
 }
 
-fn read_tsf(path: &Path) -> Result<TsfFile, Error> {
+pub(super) fn read_tsf(path: &Path) -> Result<TsfFile, Error> {
     let text = crate::io::read_text(path)?;
     TsfFile::parse(&text).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
 }

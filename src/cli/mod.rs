@@ -4,12 +4,16 @@
 
 mod adapters;
 mod args;
+mod baseline;
 mod calibrate;
+mod compare;
 pub mod demo;
+mod experiment;
 mod frames;
 mod merge;
 mod progress;
 mod response;
+mod synth;
 
 use crate::pipeline::Event;
 use clap::Parser;
@@ -47,6 +51,10 @@ pub fn run() -> ExitCode {
             println!("{text}");
             Done::AsAsked
         }),
+        args::Command::Synth(a) => synth::run(&a).map(|()| Done::AsAsked),
+        args::Command::Compare(a) => compare::run(&a).map(|()| Done::AsAsked),
+        args::Command::Baseline(a) => baseline::run(&a).map(|()| Done::AsAsked),
+        args::Command::Experiment(a) => experiment::run(&a).map(|()| Done::AsAsked),
         args::Command::Adapters => adapters::run().map(|()| Done::AsAsked),
     };
     match done {

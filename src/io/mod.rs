@@ -1,9 +1,11 @@
 //! Bytes to frames and back: files stop here, and so do the error types of the crates that read them.
 //!
 //! * [`ldr`] reads the frames (PNG, JPEG, TIFF; 8 or 16 bits), [`metadata`] their exposure times;
+//! * [`exif`] writes frames with their exposure time;
 //! * [`exr`] writes and reads linear OpenEXR;
 //! * [`output`] writes every result beside its target and renames it, so that nothing is ever half-written.
 
+pub mod exif;
 pub mod exr;
 pub mod ldr;
 pub mod metadata;

@@ -1,6 +1,7 @@
 //! The camera: frames from a scene and the poses that it went through, with shot and read noise, clipping, response and
-//! 8-bit quantisation.
+//! quantisation.
 
+use super::motion::Motion;
 use super::random::Random;
 use super::scene::Scene;
 use super::shake::{Tremor, identity};
@@ -9,7 +10,7 @@ use crate::exposure::{Bracket, Frame};
 use crate::image::{Plane, Rgb};
 use crate::response::Response;
 use crate::tsf::Tsf;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
 /// Sensor and response.
@@ -19,23 +20,27 @@ pub struct Camera {
     pub full_well: f64,
     /// Standard deviation of the read noise, electrons.
     pub read_noise: f64,
-    /// Response f; its inverse places the thresholds between the 8-bit codes.
+    /// Response f; its inverse places the thresholds between the codes.
     pub response: Response,
+    /// Bits of an intensity code, 8 to 16.
+    pub bits: u32,
 }
 
 impl Default for Camera {
-    /// A small sensor: 4000 e-, 8 e-, sRGB.
+    /// A small sensor: 4000 e-, 8 e-, sRGB, 8 bits.
     fn default() -> Self {
-        Self { full_well: 4000.0, read_noise: 8.0, response: Response::Srgb }
+        Self { full_well: 4000.0, read_noise: 8.0, response: Response::Srgb, bits: 8 }
     }
 }
 
 impl Camera {
     /// The frame that this camera makes of `irradiance` (1 is white after 1 s) in `exposure_time` seconds.
     pub fn photograph(&self, name: &str, irradiance: &Rgb, exposure_time: f64, seed: u64, stream: u64) -> Frame {
+        let levels = (1u32 << self.bits.clamp(8, 16)) - 1;
         let planes = std::array::from_fn(|c| {
-            // Z = k/255 between the thresholds f⁻¹((k ± 1/2)/255), so that the response needs its inverse only.
-            let thresholds: Vec<f64> = (0..255).map(|k| self.response.inverse(c, (f64::from(k) + 0.5) / 255.0)).collect();
+            // Z = k/L between the thresholds f⁻¹((k ± 1/2)/L), so that the response needs its inverse only.
+            let at = |k: u32| self.response.inverse(c, (f64::from(k) + 0.5) / f64::from(levels));
+            let thresholds: Vec<f64> = (0..levels).map(at).collect();
             let plane = &irradiance.0[c];
             let data: Vec<f32> = (0..plane.height)
                 .into_par_iter()
@@ -47,13 +52,13 @@ impl Camera {
                         let electrons = (f64::from(plane.at(x, y)) * exposure_time).clamp(0.0, 50.0) * self.full_well;
                         let signal = random.poisson(electrons) + self.read_noise * random.normal();
                         let exposure = (signal / self.full_well).clamp(0.0, 1.0);
-                        thresholds.partition_point(|&t| t <= exposure) as f32 / 255.0
+                        thresholds.partition_point(|&t| t <= exposure) as f32 / levels as f32
                     })
                 })
                 .collect();
             Plane { width: plane.width, height: plane.height, data }
         });
-        Frame { name: name.into(), intensity: Rgb(planes), levels: 255, exposure_time }
+        Frame { name: name.into(), intensity: Rgb(planes), levels, exposure_time }
     }
 }
 
@@ -76,57 +81,84 @@ pub struct SyntheticBracket {
 /// Those of [`Bracket::new`] and [`Tremor::tsf`].
 pub fn capture(scene: &Scene, camera: &Camera, frames: &[(f64, Option<Tremor>)], median: f64, seed: u64) -> Result<SyntheticBracket> {
     let (width, height) = scene.frame_size();
+    let motion = |(i, (time, tremor)): (usize, &(f64, Option<Tremor>))| -> Result<(f64, Motion)> {
+        let tsf = match tremor {
+            Some(t) => t.tsf(width, height, *time, seed, i as u64 + 1)?,
+            None => identity(width),
+        };
+        Ok((*time, Motion::new(tsf, tremor.is_some())))
+    };
+    let frames = frames.iter().enumerate().map(motion).collect::<Result<Vec<_>>>()?;
+    Ok(photograph(scene, camera, &frames, median, seed, false)?.0)
+}
+
+/// Photographs `scene` once per entry of `frames`: an exposure time in seconds and the camera's motion during it. As [`capture()`]
+/// otherwise. With `tripod` also the frames that a camera that did not move would have taken, with noise of their own.
+///
+/// # Errors
+/// Those of [`Bracket::new`], and a scene that is black where the frame looks.
+pub fn photograph(
+    scene: &Scene,
+    camera: &Camera,
+    frames: &[(f64, Motion)],
+    median: f64,
+    seed: u64,
+    tripod: bool,
+) -> Result<(SyntheticBracket, Option<Bracket>)> {
+    let (width, _) = scene.frame_size();
     let still = expose(scene, &identity(width));
     let mut levels = still.mean().data;
     let middle = levels.len() / 2;
     let gain = median as f32 / levels.select_nth_unstable_by(middle, f32::total_cmp).1.max(f32::MIN_POSITIVE);
     let scaled = |image: &Rgb| image.map_planes(|p| p.map(|v| v * gain));
     let truth = scaled(&still);
-    let (mut out, mut tsfs) = (Vec::new(), Vec::new());
-    for (i, (time, tremor)) in frames.iter().enumerate() {
+    let (mut out, mut tsfs, mut steady) = (Vec::new(), Vec::new(), Vec::new());
+    for (i, (time, motion)) in frames.iter().enumerate() {
         let name = format!("frame{}.png", i + 1);
         let stream = i as u64 + 1;
-        let tsf = match tremor {
-            Some(t) => t.tsf(width, height, *time, seed, stream)?,
-            None => identity(width),
-        };
-        let blurred = tremor.as_ref().map(|_| scaled(&expose(scene, &tsf)));
-        out.push(camera.photograph(&name, blurred.as_ref().unwrap_or(&truth), *time, seed, stream));
-        tsfs.push(tsf);
+        let moved = !motion.tsf.is_identity();
+        let seen = moved.then(|| scaled(&integrate(scene, &motion.homographies())));
+        out.push(camera.photograph(&name, seen.as_ref().unwrap_or(&truth), *time, seed, stream));
+        tsfs.push(motion.tsf.clone());
+        if tripod {
+            steady.push(camera.photograph(&format!("tripod{}.png", i + 1), &truth, *time, seed, TRIPOD_STREAMS + stream));
+        }
     }
-    Ok(SyntheticBracket { bracket: Bracket::new(out)?, truth, tsfs, sharp: frames.iter().map(|f| f.1.is_none()).collect() })
+    let sharp = frames.iter().map(|f| !f.1.shaken).collect();
+    let steady = if tripod { Some(Bracket::new(steady)?) } else { None };
+    Ok((SyntheticBracket { bracket: Bracket::new(out)?, truth, tsfs, sharp }, steady))
 }
 
+/// First stream of the tripod frames' noise, beyond those of any bracket's frames.
+const TRIPOD_STREAMS: u64 = 1 << 20;
+
 /// The scene averaged over the poses of `tsf`: what the sensor integrates, without noise, in the scene's own units.
+pub fn expose(scene: &Scene, tsf: &Tsf) -> Rgb {
+    let poses: Vec<_> = tsf.poses.iter().map(|p| (p.homography(tsf.focal_px) * tsf.base, p.weight)).collect();
+    integrate(scene, &poses)
+}
+
+/// The scene averaged over `poses`: homographies frame ← scene in centred pixels, and weights. No noise, the scene's own units.
 ///
 /// A pixel integrates a 1 px box, which turns with the scene (the roll is a degree or two; the difference to a box fixed on the
-/// sensor is of second order in the angle). Box and interpolation commute, so the 2x samples are box-filtered once and each
+/// sensor is of second order in the angle). Box and interpolation commute, so the samples are box-filtered once and each
 /// pose costs one bilinear sample per pixel.
-pub fn expose(scene: &Scene, tsf: &Tsf) -> Rgb {
+pub fn integrate(scene: &Scene, poses: &[(DMat3, f64)]) -> Rgb {
     let (width, height) = scene.frame_size();
     let (sw, sh) = scene.samples.size();
-    let boxed: Vec<[f32; 4]> = (0..sh)
-        .into_par_iter()
-        .flat_map_iter(|y| {
-            let below = (y + 1).min(sh - 1);
-            (0..sw).map(move |x| {
-                let right = (x + 1).min(sw - 1);
-                let mean = |p: &Plane| 0.25 * (p.at(x, y) + p.at(right, y) + p.at(x, below) + p.at(right, below));
-                let [r, g, b] = &scene.samples.0;
-                [mean(r), mean(g), mean(b), 0.0]
-            })
-        })
-        .collect();
+    let n = scene.oversampling;
+    let boxed = boxed(scene);
     let centre = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
-    let last = ((sw - 2) as f64, (sh - 2) as f64);
-    let to_scene: Vec<_> = tsf.poses.iter().map(|p| (p.homography(tsf.focal_px).inverse(), p.weight as f32)).collect();
+    let last = ((sw - n) as f64, (sh - n) as f64);
+    let to_scene: Vec<_> = poses.iter().map(|(h, weight)| (h.inverse(), *weight as f32)).collect();
     let mut pixels = vec![[0f32; 4]; width * height];
+    let k = n as f64;
     pixels.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         for (h, weight) in &to_scene {
-            // Homogeneous sample position of the row's first pixel and its step per pixel. Sample 2k and 2k + 1 make pixel k,
-            // so the boxed sample at 2k is the pixel itself.
-            let origin = 2.0 * DVec2::new(centre.0 + scene.margin as f64, centre.1 + scene.margin as f64);
-            let to_samples = |q: DVec3| DVec3::new(2.0 * q.x + origin.x * q.z, 2.0 * q.y + origin.y * q.z, q.z);
+            // Homogeneous sample position of the row's first pixel and its step per pixel. Samples n k to n k + n - 1 make pixel k,
+            // so the boxed sample at n k is the pixel itself.
+            let origin = k * DVec2::new(centre.0 + scene.margin as f64, centre.1 + scene.margin as f64);
+            let to_samples = |q: DVec3| DVec3::new(k * q.x + origin.x * q.z, k * q.y + origin.y * q.z, q.z);
             let first = to_samples(*h * DVec3::new(-centre.0, y as f64 - centre.1, 1.0));
             let step = to_samples(h.x_axis);
             let flat = step.z == 0.0;
@@ -134,7 +166,7 @@ pub fn expose(scene: &Scene, tsf: &Tsf) -> Rgb {
                 let q = first + step * x as f64;
                 let q = if flat { q.truncate() / first.z } else { q.truncate() / q.z };
                 let (u, v) = (q.x.clamp(0.0, last.0), q.y.clamp(0.0, last.1));
-                let (i, j) = (u as u32 as usize, v as u32 as usize);
+                let (i, j) = ((u as usize).min(sw - 2), (v as usize).min(sh - 2));
                 let (a, b) = ((u - i as f64) as f32, (v - j as f64) as f32);
                 let at = j * sw + i;
                 let (p, q) = (&boxed[at..at + 2], &boxed[at + sw..at + sw + 2]);
@@ -146,4 +178,27 @@ pub fn expose(scene: &Scene, tsf: &Tsf) -> Rgb {
         }
     });
     Rgb(std::array::from_fn(|c| Plane { width, height, data: pixels.iter().map(|p| p[c]).collect() }))
+}
+
+/// Means over the pixel-sized square whose first sample is (x, y), for each sample.
+fn boxed(scene: &Scene) -> Vec<[f32; 4]> {
+    let (sw, sh) = scene.samples.size();
+    let n = scene.oversampling;
+    (0..sh)
+        .into_par_iter()
+        .flat_map_iter(|y| {
+            (0..sw).map(move |x| {
+                let mut sum = [0f32; 4];
+                for j in y..y + n {
+                    for i in x..x + n {
+                        let at = j.min(sh - 1) * sw + i.min(sw - 1);
+                        for (sum, plane) in sum.iter_mut().zip(&scene.samples.0) {
+                            *sum += plane.data[at];
+                        }
+                    }
+                }
+                sum.map(|v| v / (n * n) as f32)
+            })
+        })
+        .collect()
 }

@@ -40,7 +40,25 @@ pub fn width(text: &str, height: f32) -> f32 {
 pub fn distance([a, b]: [(f32, f32); 2], x: f32, y: f32) -> f32 {
     let (dx, dy) = (b.0 - a.0, b.1 - a.1);
     let t = (((x - a.0) * dx + (y - a.1) * dy) / (dx * dx + dy * dy).max(1e-9)).clamp(0.0, 1.0);
-    (x - a.0 - t * dx).hypot(y - a.1 - t * dy)
+    let (u, v) = (x - a.0 - t * dx, y - a.1 - t * dy);
+    (u * u + v * v).sqrt()
+}
+
+/// Writes light `text` on the dark ground of `image`; upper left corner at (x, y), capitals `height` pixels high.
+pub fn write(image: &mut image::RgbImage, text: &str, x: f32, y: f32, height: f32) {
+    let radius = 0.07 * height;
+    for [a, b] in segments(text, height) {
+        let (a, b) = ((a.0 + x, a.1 + y), (b.0 + x, b.1 + y));
+        let range = |p: f32, q: f32, n: u32| ((p.min(q) - 2.0).max(0.0) as u32, ((p.max(q) + 3.0) as u32).min(n));
+        let ((x0, x1), (y0, y1)) = (range(a.0, b.0, image.width()), range(a.1, b.1, image.height()));
+        for v in y0..y1 {
+            for u in x0..x1 {
+                let cover = (radius + 0.5 - distance([a, b], u as f32, v as f32)).clamp(0.0, 1.0);
+                let pixel = &mut image.get_pixel_mut(u, v).0;
+                *pixel = pixel.map(|c| c.max((235.0 * cover) as u8));
+            }
+        }
+    }
 }
 
 fn glyph(c: char) -> &'static str {

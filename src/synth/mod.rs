@@ -2,10 +2,15 @@
 
 pub mod capture;
 pub mod font;
+pub mod gyro;
+mod maths;
+pub mod motion;
 pub mod random;
 pub mod scene;
 pub mod shake;
 
-pub use capture::{Camera, SyntheticBracket, capture, expose};
-pub use scene::{Scene, room};
+pub use capture::{Camera, SyntheticBracket, capture, expose, integrate, photograph};
+pub use gyro::GyroRecord;
+pub use motion::{Motion, Shake, Wobble};
+pub use scene::{Drawn, Scene, room};
 pub use shake::{Tremor, identity};

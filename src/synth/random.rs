@@ -1,5 +1,6 @@
 //! Seeded random numbers: uniform, normal, Poisson.
 
+use super::maths::Portable;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
@@ -20,7 +21,7 @@ impl Random {
     /// Normal with mean 0 and variance 1 (Box and Muller).
     pub fn normal(&mut self) -> f64 {
         let (a, b): (f64, f64) = (self.0.random(), self.0.random());
-        (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+        (-2.0 * (1.0 - a).logarithm()).sqrt() * (std::f64::consts::TAU * b).cosine()
     }
 
     /// Poisson with the given mean: by products of uniforms below 10 (Knuth), above by transformed rejection (W. Hörmann,
@@ -30,7 +31,7 @@ impl Random {
             return 0.0;
         }
         if mean < 10.0 {
-            let limit = (-mean).exp();
+            let limit = (-mean).exponential();
             let (mut product, mut k) = (self.0.random::<f64>(), 0.0);
             while product > limit {
                 product *= self.0.random::<f64>();
@@ -53,7 +54,7 @@ impl Random {
             if k < 0.0 || (us < 0.013 && v > us) {
                 continue;
             }
-            if (v * inverse_alpha / (a / (us * us) + b)).ln() <= k * mean.ln() - mean - ln_factorial(k) {
+            if (v * inverse_alpha / (a / (us * us) + b)).logarithm() <= k * mean.logarithm() - mean - ln_factorial(k) {
                 return k;
             }
         }
@@ -63,8 +64,8 @@ impl Random {
 /// ln k! (Stirling's series, exact to 1e-9 from k = 10; the product below).
 fn ln_factorial(k: f64) -> f64 {
     if k < 10.0 {
-        return (2..=k as u32).map(|i| f64::from(i).ln()).sum();
+        return (2..=k as u32).map(|i| f64::from(i).logarithm()).sum();
     }
     let n = k + 1.0;
-    (n - 0.5) * n.ln() - n + 0.5 * std::f64::consts::TAU.ln() + 1.0 / (12.0 * n) - 1.0 / (360.0 * n.powi(3))
+    (n - 0.5) * n.logarithm() - n + 0.5 * std::f64::consts::TAU.logarithm() + 1.0 / (12.0 * n) - 1.0 / (360.0 * n.powi(3))
 }

@@ -1,5 +1,6 @@
 //! Hand tremor: a smooth random camera path, continuous in time, off every grid of poses.
 
+use super::maths::Portable;
 use super::random::Random;
 use crate::error::Result;
 use crate::pose::Pose;
@@ -9,25 +10,25 @@ use crate::tsf::Tsf;
 const WAVES: usize = 24;
 
 /// One degree of freedom: drift and sine waves.
-struct Wander {
+pub(super) struct Wander {
     drift: f64,
     waves: Vec<[f64; 3]>,
 }
 
 impl Wander {
-    fn new(random: &mut Random) -> Self {
+    pub(super) fn new(random: &mut Random) -> Self {
         let waves = (0..WAVES)
             .map(|i| {
                 let hz = 2.0 + 10.0 * i as f64 / (WAVES - 1) as f64;
                 // Amplitudes fall with frequency as a hand's do: the muscles push a mass.
-                [random.normal() / (hz / 2.0).powf(1.8), std::f64::consts::TAU * hz, random.uniform(0.0, std::f64::consts::TAU)]
+                [random.normal() / (hz / 2.0).power(1.8), std::f64::consts::TAU * hz, random.uniform(0.0, std::f64::consts::TAU)]
             })
             .collect();
         Self { drift: 2.5 * random.normal(), waves }
     }
 
-    fn at(&self, t: f64) -> f64 {
-        self.drift * t + self.waves.iter().map(|[a, w, phase]| a * (w * t + phase).sin()).sum::<f64>()
+    pub(super) fn at(&self, t: f64) -> f64 {
+        self.drift * t + self.waves.iter().map(|[a, w, phase]| a * (w * t + phase).sine()).sum::<f64>()
     }
 }
 
@@ -64,10 +65,10 @@ impl Tremor {
         };
         let shift = self.extent_px / range(0).max(range(1));
         let scale = [shift, shift, self.roll_deg / range(2)];
-        let corner = 0.5 * (width as f64).hypot(height as f64);
+        let corner = 0.5 * (width as f64).length(height as f64);
         let steps = probe.windows(2).map(|w| {
             let d: [f64; 3] = std::array::from_fn(|i| (w[1][i] - w[0][i]) * scale[i]);
-            d[0].hypot(d[1]) + d[2].abs().to_radians() * corner
+            d[0].length(d[1]) + d[2].abs().to_radians() * corner
         });
         let longest = steps.fold(0.0, f64::max);
         let n = ((longest * probe.len() as f64 / 0.25).ceil() as usize).max(2);

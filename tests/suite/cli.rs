@@ -460,3 +460,86 @@ fn office_is_calibrated_and_merged() {
     let off = log_difference(&image, &plain, 1.0 / factor.unwrap() as f32);
     assert!(off < 0.15, "log irradiance differs from the plain merge by {off:.3}");
 }
+
+#[test]
+fn synth_makes_a_bracket_that_merge_and_compare_understand() {
+    let dir = tempdir().unwrap();
+    let run = |line: &str| {
+        let out = unshaken(dir.path(), &line.split_whitespace().collect::<Vec<_>>());
+        assert!(out.status.success(), "{line}: {}", String::from_utf8_lossy(&out.stderr));
+        String::from_utf8(out.stdout).unwrap()
+    };
+    let made =
+        run("synth --scene chart --size 96x72 --exposures 1/30,1/8,1 --extent 5 --shift 4 --jpeg 97 --tripod --seed 3 --output-dir b");
+    assert!(made.contains("wrote 3 frames of 96 x 72 pixels to b, 1 of them shaken"), "{made}");
+    assert_eq!(
+        listing(&dir.path().join("b")),
+        [
+            "bracket.json",
+            "frame1.jpg",
+            "frame2.jpg",
+            "frame3.jpg",
+            "tripod1.jpg",
+            "tripod2.jpg",
+            "tripod3.jpg",
+            "truth.exr",
+            "truth_tsf.json"
+        ]
+    );
+    // Exposure times come from EXIF, the TSFs from the file.
+    let description: Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("b/bracket.json")).unwrap()).unwrap();
+    let tsfs = TsfFile::parse(&std::fs::read_to_string(dir.path().join("b/truth_tsf.json")).unwrap()).unwrap();
+    assert_eq!(tsfs.frames.len(), 3);
+    assert!(description["frames"][2]["poses"].as_array().unwrap().len() > 10);
+    assert_eq!(description["frames"][1]["sharp"], true);
+    for (i, time) in [1.0 / 30.0, 0.125, 1.0].into_iter().enumerate() {
+        let noted = unshaken::io::metadata::exposure_time(&dir.path().join(format!("b/frame{}.jpg", i + 1))).unwrap().unwrap();
+        assert!((noted / time - 1.0).abs() < 1e-6, "{noted}");
+    }
+    // The truth against itself, and the tripod's merge against the truth.
+    let same = run("compare b/truth.exr b/truth.exr --json");
+    let same: Value = serde_json::from_str(&same).unwrap();
+    assert!(same["pu_psnr"].is_null() && same["pu_ssim"].as_f64().unwrap() > 0.999_999, "{same}");
+    let limit = description["truth"]["limit"].as_f64().unwrap();
+    let line = format!(
+        "baseline --output-dir m --method debevec,mertens,tripod --tripod b/tripod1.jpg,b/tripod2.jpg,b/tripod3.jpg --truth b/truth.exr --limit {limit} b/frame1.jpg b/frame2.jpg b/frame3.jpg"
+    );
+    let table = run(&line);
+    let psnr = |name: &str| -> f64 {
+        let row = table.lines().find(|l| l.starts_with(name)).unwrap_or_else(|| panic!("{table}"));
+        row.split_whitespace().nth(1).unwrap().parse().unwrap()
+    };
+    assert!(psnr("tripod") > psnr("debevec") + 5.0, "{table}");
+    assert!(table.contains("mertens") && table.contains("(no irradiance)"), "{table}");
+    assert_eq!(listing(&dir.path().join("m")), ["debevec.exr", "debevec.png", "mertens.png", "tripod.exr", "tripod.png"]);
+    let rows: Value = serde_json::from_str(&run("compare --align rigid --json m/debevec.exr m/tripod.exr b/truth.exr")).unwrap();
+    assert!(rows[1]["pu_psnr"].as_f64().unwrap() > rows[0]["pu_psnr"].as_f64().unwrap() && rows[0]["moved"]["x"].is_number(), "{rows}");
+    run("compare --map error.png m/tripod.exr b/truth.exr");
+    assert_eq!(image::open(dir.path().join("error.png")).unwrap().to_rgb8().dimensions(), (48, 24));
+    let alone: Value = serde_json::from_str(&run("compare --no-reference --json m/tripod.png b/frame3.jpg")).unwrap();
+    assert!(alone[0]["sharpness"].as_f64().unwrap() > alone[1]["sharpness"].as_f64().unwrap(), "{alone}");
+}
+
+#[test]
+fn wrong_synth_compare_and_baseline_options_are_refused() {
+    assert_refused(&[
+        ("synth --output-dir out", 2, &["SCENE.exr"]),
+        ("synth --scene cellar --output-dir out", 2, &["--scene", "cellar", "foliage"]),
+        ("synth --scene room --exposures 1 --output-dir out", 2, &["--exposures", "two or more"]),
+        ("synth --scene room --exposures 1,x --output-dir out", 2, &["--exposures", "\"x\"", "1/30"]),
+        ("synth --scene room --shake jelly --output-dir out", 2, &["--shake", "gyro:FILE"]),
+        ("synth --scene room --shake gyro:tsf.json --output-dir out", 1, &["tsf.json", "gyroscope"]),
+        ("synth --scene room --shaken 9 --output-dir out", 2, &["--shaken", "no frame 9"]),
+        ("synth --scene room --size 8x8 --output-dir out", 2, &["--size", "640x480"]),
+        ("synth --scene room --full-well 0 --output-dir out", 2, &["--full-well", "positive"]),
+        ("synth --scene room --jpeg 90 --bits 12 --output-dir out", 2, &["--jpeg", "8 bits"]),
+        ("synth --scene room --response nothing.json --output-dir out", 1, &["nothing.json", "--response"]),
+        ("compare there.exr", 2, &["--no-reference"]),
+        ("compare there.exr there.exr", 1, &["there.exr", "OpenEXR"]),
+        ("compare --no-reference text.png", 1, &["text.png", "not a picture"]),
+        ("compare --no-reference a.png", 1, &["a.png", "64 pixels"]),
+        ("experiment fig99 --output-dir other", 2, &["fig99", "fig5", "sharpness"]),
+        ("baseline --output-dir other --method tripod --exposures 1,2 a.png b.png", 2, &["--tripod", "0 tripod frames for 2 frames"]),
+        ("baseline --output-dir other --method mertens,mertens --exposures 1,2 a.png b.png", 2, &["--method", "named twice"]),
+    ]);
+}

@@ -18,7 +18,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
     ("mask", &["error", "image", "exposure", "pose"]),
     ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),
-    ("baseline", &["error", "image", "exposure", "response", "mask", "noise"]),
+    ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
     ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft"]),
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
@@ -53,6 +53,26 @@ const TABLE: &[(&str, &[&str])] = &[
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
+    // The paper's experiments: brackets, the pipeline, baselines, judges.
+    (
+        "experiments",
+        &[
+            "error",
+            "image",
+            "pose",
+            "exposure",
+            "response",
+            "baseline",
+            "metrics",
+            "tonemap",
+            "synth",
+            "pipeline",
+            "psf::Psf",
+            "tsf::Tsf",
+            "tsf::TsfEntry",
+            "tsf::TsfFile",
+        ],
+    ),
     // The edges of the program.
     ("io", &["error", "image", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
     (
@@ -64,6 +84,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "noise::NoiseModel",
             "response",
             "baseline",
+            "experiments",
             "io",
             "pipeline",
             "metrics",

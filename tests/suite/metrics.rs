@@ -1,7 +1,7 @@
 //! The quality measures against stored values of an independent implementation, and their behaviour on plain cases.
 
 use unshaken::image::{Plane, Rgb};
-use unshaken::metrics::{Judge, pu21, score};
+use unshaken::metrics::{Align, Judge, Moved, Score, align, cpbd, error_map, pu21, score};
 
 /// Truth and estimate, 160 x 120, from a formula that Python repeats:
 ///
@@ -9,30 +9,170 @@ use unshaken::metrics::{Judge, pu21, score};
 /// y, x, c = np.mgrid[0:120, 0:160, 0:3].astype(float)
 /// t = np.exp(3 * np.sin(0.11 * x + 0.3 * c) * np.cos(0.07 * y) + 2 * np.sin(0.9 * x) * np.sin(0.8 * y))
 /// e = 1.7 * t * (1 + 0.2 * np.sin(1.3 * x + 0.7 * y + c)) + 0.01
-/// s = metrics.score(e.astype(np.float32), t.astype(np.float32), limit=limit); print(s["pu_psnr"], s["edge_ratio"])
+/// s = metrics.score(e.astype(np.float32), t.astype(np.float32), limit=limit); print(s)
 /// ```
 fn pair() -> (Rgb, Rgb) {
     let truth =
         |x: f64, y: f64, c: f64| (3.0 * (0.11 * x + 0.3 * c).sin() * (0.07 * y).cos() + 2.0 * (0.9 * x).sin() * (0.8 * y).sin()).exp();
-    let image = |f: &dyn Fn(f64, f64, f64) -> f64| {
-        Rgb(std::array::from_fn(|c| Plane::from_fn(160, 120, |x, y| f(x as f64, y as f64, c as f64) as f32)))
-    };
     let estimate = |x: f64, y: f64, c: f64| 1.7 * truth(x, y, c) * (1.0 + 0.2 * (1.3 * x + 0.7 * y + c).sin()) + 0.01;
     (image(&estimate), image(&truth))
 }
 
-/// (limit, pu_psnr, edge_ratio) as printed by the lines above.
-const STORED: [(Option<f32>, f64, f64); 2] =
-    [(None, 35.087072131409315, 1.0185661315917969), (Some(100.0), 35.57834816271845, 1.017935872077942)];
+/// 160 x 120 pixels of a formula of (x, y, channel).
+fn image(f: &dyn Fn(f64, f64, f64) -> f64) -> Rgb {
+    Rgb(std::array::from_fn(|c| Plane::from_fn(160, 120, |x, y| f(x as f64, y as f64, c as f64) as f32)))
+}
+
+/// (limit, pu_psnr, pu_ssim, pu_dark, mu_psnr, edge_ratio) as printed by the lines above (NumPy, scikit-image's structural_similarity).
+const STORED: [(Option<f32>, [f64; 5]); 2] = [
+    (None, [35.087072131409315, 0.995466947555542, 37.548901177645234, 35.9210601021701, 1.0185661315917969]),
+    (Some(100.0), [35.57834816271845, 0.9954655766487122, 38.00697166151547, 35.54788396745292, 1.017935872077942]),
+];
+
+#[track_caller]
+fn assert_agrees(what: &str, s: &Score, [psnr, ssim, dark, mu, edge]: [f64; 5], decibel: f64) {
+    assert!((s.pu_psnr - psnr).abs() < decibel, "{what}: PSNR {} dB, stored {psnr}", s.pu_psnr);
+    assert!((s.pu_ssim - ssim).abs() < 1e-4, "{what}: SSIM {}, stored {ssim}", s.pu_ssim);
+    assert!((s.pu_dark - dark).abs() < decibel, "{what}: dark {} dB, stored {dark}", s.pu_dark);
+    assert!((s.mu_psnr - mu).abs() < decibel, "{what}: mu-law {} dB, stored {mu}", s.mu_psnr);
+    assert!((s.edge_ratio / edge - 1.0).abs() < 3e-3, "{what}: edge ratio {}, stored {edge}", s.edge_ratio);
+}
 
 #[test]
 fn agrees_with_the_independent_implementation() {
     let (estimate, truth) = pair();
-    for (limit, psnr, edge) in STORED {
+    for (limit, stored) in STORED {
         let s = score(&estimate, &truth, &Judge { limit, ..Judge::default() }).unwrap();
-        assert!((s.pu_psnr - psnr).abs() < 0.05, "{limit:?}: {} dB, stored {psnr}", s.pu_psnr);
-        assert!((s.edge_ratio / edge - 1.0).abs() < 2e-3, "{limit:?}: edge ratio {}, stored {edge}", s.edge_ratio);
+        assert_agrees(&format!("{limit:?}"), &s, stored, 0.005);
     }
+}
+
+/// A smoother scene, and an estimate of it that lies (2.3, -1.6) px and 0.6° off; in Python as above, with
+///
+/// ```python
+/// def scene(x, y, c): return np.exp(2.2*np.sin(0.11*x+0.3*c)*np.cos(0.07*y) + np.sin(0.37*x+0.05*y)*np.sin(0.31*y))
+/// a = np.deg2rad(0.6); u, v = x - 79.5, y - 59.5
+/// X, Y = np.cos(a)*u - np.sin(a)*v + 2.3 + 79.5, np.sin(a)*u + np.cos(a)*v - 1.6 + 59.5
+/// e = 1.7 * scene(X, Y, c) * (1 + 0.1 * np.sin(1.3*x + 0.7*y + c)); t = scene(x, y, c)   # score(..., rigid=True)
+/// ```
+fn moved_pair() -> (Rgb, Rgb) {
+    let scene = |x: f64, y: f64, c: f64| {
+        (2.2 * (0.11 * x + 0.3 * c).sin() * (0.07 * y).cos() + (0.37 * x + 0.05 * y).sin() * (0.31 * y).sin()).exp()
+    };
+    let (sin, cos) = 0.6f64.to_radians().sin_cos();
+    let estimate = |x: f64, y: f64, c: f64| {
+        let (u, v) = (x - 79.5, y - 59.5);
+        let at = scene(cos * u - sin * v + 2.3 + 79.5, sin * u + cos * v - 1.6 + 59.5, c);
+        1.7 * at * (1.0 + 0.1 * (1.3 * x + 0.7 * y + c).sin())
+    };
+    (image(&estimate), image(&scene))
+}
+
+#[test]
+fn a_moved_estimate_is_judged_as_the_independent_implementation_does() {
+    let (estimate, truth) = moved_pair();
+    let judge = Judge::default();
+    let unmoved = score(&estimate, &truth, &judge).unwrap();
+    assert_agrees(
+        "as it lies",
+        &unmoved,
+        [21.930048970645963, 0.7009026408195496, 22.710399035897343, 24.06684258917087, 1.0403050184249878],
+        0.005,
+    );
+    let (still, moved) = align(&estimate, &truth, Align::None).unwrap();
+    assert!(still == truth && moved == Moved::default());
+    let (truth_there, moved) = align(&estimate, &truth, Align::Rigid).unwrap();
+    let off = (moved.x - 2.3).abs().max((moved.y + 1.6).abs()).max((moved.roll_deg - 0.6).abs());
+    assert!(off < 0.02, "{moved:?}");
+    let s = score(&estimate, &truth_there, &judge).unwrap();
+    // OpenCV's interpolation knows positions to 1/32 px only.
+    assert_agrees("rigid", &s, [39.4809363140846, 0.9929471611976624, 40.406207109588436, 41.64481500846285, 1.0400046110153198], 0.05);
+    let (truth_there, moved) = align(&estimate, &truth, Align::Shift).unwrap();
+    assert!((moved.x - 2.3).abs() < 0.3 && (moved.y + 1.6).abs() < 0.3 && moved.roll_deg == 0.0, "{moved:?}");
+    let shifted = score(&estimate, &truth_there, &judge).unwrap();
+    assert!(shifted.pu_psnr > unmoved.pu_psnr + 3.0 && shifted.pu_psnr < s.pu_psnr - 3.0, "{shifted:?}");
+}
+
+#[test]
+fn nothing_moves_where_nothing_is_displaced() {
+    let (_, truth) = moved_pair();
+    let (there, moved) = align(&truth, &truth, Align::Rigid).unwrap();
+    assert_eq!((there, moved), (truth, Moved::default()));
+    let flat = Rgb::filled(96, 80, 0.5);
+    assert_eq!(align(&flat, &flat, Align::Rigid).unwrap().1, Moved::default());
+}
+
+/// Grey picture of 256 x 192 pixels whose edges are the sharper the larger `s` is.
+fn picture(s: f64) -> Plane {
+    Plane::from_fn(256, 192, |x, y| {
+        let (x, y) = (x as f64, y as f64);
+        let edge = ((0.19 * x + 0.01 * y + 0.02 * y).sin() * s).tanh() * (0.03 * y).cos();
+        (128.0 + 100.0 * edge + 12.0 * (2.1 * x).sin() * (1.7 * y).sin()).clamp(0.0, 255.0).round_ties_even() as f32
+    })
+}
+
+#[test]
+fn sharpness_agrees_with_the_published_program() {
+    // pip package cpbd 1.0.7, cpbd.compute(np.round(np.clip(128 + 100*np.tanh(np.sin(0.19*x+0.01*y+0.02*y)*s)*np.cos(0.03*y)
+    //     + 12*np.sin(2.1*x)*np.sin(1.7*y), 0, 255))) with y, x = np.mgrid[0:192, 0:256].
+    for (s, stored) in [(1.0, 0.7180743423154755), (4.0, 0.15468506565768975), (12.0, 0.4775776159448064)] {
+        let got = cpbd(&picture(s));
+        assert!((got - stored).abs() < 0.005, "{s}: {got}, stored {stored}");
+    }
+}
+
+#[test]
+fn blur_lowers_sharpness_and_a_flat_picture_has_none() {
+    // Steps of one pixel are no edges to Sobel's thinning: two neighbours are equally steep.
+    let bar = |x: usize| if x.is_multiple_of(16) { 125.0 } else { [210.0, 40.0][x / 16 % 2] };
+    let bars = Plane::from_fn(192, 192, |x, _| bar(x));
+    let blurred = |n: isize| {
+        Plane::from_fn(192, 192, |x, y| (-n..=n).map(|d| bars.clamped(x as isize + d, y as isize)).sum::<f32>() / (2 * n + 1) as f32)
+    };
+    let (sharp, soft, softer) = (cpbd(&bars), cpbd(&blurred(1)), cpbd(&blurred(4)));
+    assert!(sharp > 0.95 && softer < 0.05 && soft <= sharp && soft >= softer, "{sharp} {soft} {softer}");
+    assert_eq!(cpbd(&Plane::filled(128, 128, 90.0)), 0.0);
+}
+
+#[test]
+fn the_error_map_shows_the_sign() {
+    let (_, truth) = pair();
+    let mut wrong = truth.clone();
+    for p in wrong.0.iter_mut() {
+        for y in 0..p.height {
+            for x in 0..p.width {
+                let k = if x < 50 {
+                    1.3
+                } else if x > 110 {
+                    0.7
+                } else {
+                    1.0
+                };
+                p.data[y * p.width + x] *= k;
+            }
+        }
+    }
+    let map = error_map(&wrong, &truth, &Judge { limit: Some(1e9), ..Judge::default() }).unwrap();
+    assert_eq!(map.dimensions(), (112, 72));
+    let sum = |x0: u32, x1: u32, c: usize| {
+        (0..72).flat_map(|y| (x0..x1).map(move |x| (x, y))).map(|(x, y)| u64::from(map.get_pixel(x, y).0[c])).sum::<u64>()
+    };
+    assert!(sum(0, 24, 0) > 50_000 && sum(0, 24, 2) < sum(0, 24, 0) / 4, "too bright is red");
+    assert!(sum(88, 112, 2) > 50_000 && sum(88, 112, 0) < sum(88, 112, 2) / 4, "too dark is blue");
+    assert_eq!(sum(30, 84, 0) + sum(30, 84, 2), 0, "right is black");
+}
+
+#[test]
+fn zones_are_judged_apart() {
+    let (_, truth) = pair();
+    let lum = truth.mean();
+    let mut wrong = truth.clone();
+    // An error in highlights alone.
+    for p in wrong.0.iter_mut() {
+        p.data.iter_mut().zip(&lum.data).filter(|(_, l)| **l > 40.0).for_each(|(v, _)| *v *= 1.2);
+    }
+    let s = score(&wrong, &truth, &Judge::default()).unwrap();
+    assert!(s.pu_dark.is_infinite() && s.pu_bright < s.pu_mid, "{s:?}");
 }
 
 #[test]

@@ -181,7 +181,7 @@ fn film_response() -> Response {
 
 /// A room through a film-like camera, the last of four frames shaken; and the true curve.
 fn shaken_bracket() -> Bracket {
-    let camera = Camera { full_well: 6000.0, read_noise: 6.0, response: film_response() };
+    let camera = Camera { full_well: 6000.0, read_noise: 6.0, response: film_response(), ..Camera::default() };
     let tremor = Tremor { extent_px: 8.0, roll_deg: 0.6, offset_px: 1.5, offset_deg: 0.0 };
     let times = [(0.02, None), (0.06, None), (0.2, None), (0.6, Some(tremor))];
     synth::capture(&synth::room(240, 180, 24, 3), &camera, &times, 0.5, 5).unwrap().bracket

@@ -1,160 +1,14 @@
-//! A room at night, drawn by the program: lamps, a window, book spines, a test chart, a plant; about five decades of radiance.
+//! A room at night: lamps, a window, book spines, a test chart, a plant; about five decades of radiance.
 
-use super::font;
-use super::random::Random;
-use crate::image::{Plane, Rgb};
-
-type Colour = [f32; 3];
-
-/// Linear radiance at twice the frame's resolution, with real content round the frame.
-pub struct Scene {
-    /// `2 (width + 2 margin)` x `2 (height + 2 margin)` samples; samples 2k and 2k + 1 make pixel `k - margin` of the frame.
-    pub samples: Rgb,
-    /// Pixels of content beyond each side of the frame.
-    pub margin: usize,
-}
-
-impl Scene {
-    /// Size of the frame, without margin: (width, height) in pixels.
-    pub fn frame_size(&self) -> (usize, usize) {
-        let (w, h) = self.samples.size();
-        (w / 2 - 2 * self.margin, h / 2 - 2 * self.margin)
-    }
-}
-
-/// What covers a point: diffuse reflectance, own radiance, and how much of the room's light reaches it.
-#[derive(Clone, Copy)]
-struct Ink {
-    albedo: Colour,
-    emission: Colour,
-    light: f32,
-}
-
-fn paint(albedo: Colour) -> Ink {
-    Ink { albedo, emission: [0.0; 3], light: 1.0 }
-}
-
-fn glow(emission: Colour) -> Ink {
-    Ink { albedo: [0.0; 3], emission, light: 1.0 }
-}
-
-fn times(c: Colour, k: f32) -> Colour {
-    c.map(|v| v * k)
-}
-
-fn mix(a: Colour, b: Colour, t: f32) -> Colour {
-    std::array::from_fn(|i| a[i] + (b[i] - a[i]) * t)
-}
-
-fn smooth(low: f32, high: f32, x: f32) -> f32 {
-    let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
-    t * t * (3.0 - 2.0 * t)
-}
-
-/// Value noise in 0..=1 at (x, y), one cell per unit.
-fn grain(x: f32, y: f32, seed: u32) -> f32 {
-    let hash = |i: i32, j: i32| {
-        let mut h = (i as u32).wrapping_mul(0x9e37_79b1) ^ (j as u32).wrapping_mul(0x85eb_ca77) ^ seed.wrapping_mul(0xc2b2_ae3d);
-        h = (h ^ (h >> 15)).wrapping_mul(0x2c1b_3c6d);
-        h = (h ^ (h >> 12)).wrapping_mul(0x297a_2d39);
-        ((h ^ (h >> 15)) >> 8) as f32 / (1u32 << 24) as f32
-    };
-    let (i, j) = (x.floor(), y.floor());
-    let (a, b) = (smooth(0.0, 1.0, x - i), smooth(0.0, 1.0, y - j));
-    let (i, j) = (i as i32, j as i32);
-    let top = hash(i, j) * (1.0 - a) + hash(i + 1, j) * a;
-    let low = hash(i, j + 1) * (1.0 - a) + hash(i + 1, j + 1) * a;
-    top * (1.0 - b) + low * b
-}
-
-/// Several octaves of [`grain`], about 0.5.
-fn texture(x: f32, y: f32, seed: u32) -> f32 {
-    (0..4).map(|o| grain(x * 2f32.powi(o), y * 2f32.powi(o), seed + o as u32) * 0.5f32.powi(o + 1)).sum::<f32>() / 0.9375
-}
-
-/// The picture while it is drawn. Design units: the frame is 512 x 384 about (256, 192).
-struct Canvas {
-    width: usize,
-    height: usize,
-    /// Samples per design unit.
-    scale: f32,
-    /// Design coordinates of sample 0.
-    origin: (f32, f32),
-    ink: Vec<Ink>,
-}
-
-type Bounds = (f32, f32, f32, f32);
-
-impl Canvas {
-    /// Covers `bounds` (x0, y0, x1, y1) with `ink(x, y)` where the signed distance `shape(x, y)` is negative.
-    fn draw(&mut self, bounds: Bounds, shape: impl Fn(f32, f32) -> f32, ink: impl Fn(f32, f32) -> Ink) {
-        let index = |v: f32, origin: f32, n: usize, grow: f32| ((v - origin) * self.scale + grow).clamp(0.0, n as f32) as usize;
-        let (x0, x1) = (index(bounds.0, self.origin.0, self.width, -1.0), index(bounds.2, self.origin.0, self.width, 2.0));
-        let (y0, y1) = (index(bounds.1, self.origin.1, self.height, -1.0), index(bounds.3, self.origin.1, self.height, 2.0));
-        for j in y0..y1 {
-            let y = self.origin.1 + j as f32 / self.scale;
-            for i in x0..x1 {
-                let x = self.origin.0 + i as f32 / self.scale;
-                let cover = (0.5 - shape(x, y) * self.scale).clamp(0.0, 1.0);
-                if cover > 0.0 {
-                    let (below, above) = (self.ink[j * self.width + i], ink(x, y));
-                    self.ink[j * self.width + i] = Ink {
-                        albedo: mix(below.albedo, above.albedo, cover),
-                        emission: mix(below.emission, above.emission, cover),
-                        light: below.light + (above.light - below.light) * cover,
-                    };
-                }
-            }
-        }
-    }
-
-    fn rect(&mut self, b: Bounds, ink: impl Fn(f32, f32) -> Ink) {
-        self.draw(b, |x, y| (b.0 - x).max(x - b.2).max(b.1 - y).max(y - b.3), ink);
-    }
-
-    fn disc(&mut self, x0: f32, y0: f32, r: f32, ink: impl Fn(f32, f32) -> Ink) {
-        self.draw((x0 - r, y0 - r, x0 + r, y0 + r), |x, y| (x - x0).hypot(y - y0) - r, ink);
-    }
-
-    fn line(&mut self, a: (f32, f32), b: (f32, f32), radius: f32, ink: Ink) {
-        let bounds = (a.0.min(b.0) - radius, a.1.min(b.1) - radius, a.0.max(b.0) + radius, a.1.max(b.1) + radius);
-        self.draw(bounds, |x, y| font::distance([a, b], x, y) - radius, |_, _| ink);
-    }
-
-    /// A trapezium from (y0, half width w0) to (y1, half width w1) about x.
-    fn trapezium(&mut self, x0: f32, (y0, w0): (f32, f32), (y1, w1): (f32, f32), ink: impl Fn(f32, f32) -> Ink) {
-        let w = w0.max(w1);
-        let half = |y: f32| w0 + (w1 - w0) * (y - y0) / (y1 - y0);
-        self.draw((x0 - w, y0, x0 + w, y1), |x, y| ((x - x0).abs() - half(y)).max(y0 - y).max(y - y1), ink);
-    }
-
-    /// Text with its upper left corner at (x, y), or, `up`wards, its lower left corner there and running up.
-    fn text(&mut self, text: &str, x: f32, y: f32, height: f32, radius: f32, up: bool, ink: Ink) {
-        for [a, b] in font::segments(text, height) {
-            let place = |p: (f32, f32)| if up { (x + p.1, y - p.0) } else { (x + p.0, y + p.1) };
-            self.line(place(a), place(b), radius, ink);
-        }
-    }
-
-    /// Text of the largest height that fits `wide` but at most `height`, centred on x.
-    fn centred(&mut self, text: &str, x: f32, y: f32, height: f32, radius: f32, ink: Ink) {
-        self.text(text, x - 0.5 * font::width(text, height), y, height, radius, false, ink);
-    }
-}
+use super::Scene;
+use super::canvas::{Canvas, Colour, EVERYWHERE, Ink, glow, grain, mix, paint, smooth, texture, times};
+use crate::synth::font;
+use crate::synth::maths::Portable;
+use crate::synth::random::Random;
 
 /// The room, for frames of `width` x `height` pixels with `margin` pixels more on every side. Deterministic in `seed`.
-pub fn room(width: usize, height: usize, margin: usize, seed: u64) -> Scene {
-    let per_pixel = (512.0 / width.max(1) as f32).min(384.0 / height.max(1) as f32);
-    let (w, h) = (2 * (width + 2 * margin), 2 * (height + 2 * margin));
-    let scale = 2.0 / per_pixel;
-    let black = paint([0.0; 3]);
-    let mut c = Canvas {
-        width: w,
-        height: h,
-        scale,
-        origin: (256.0 - 0.5 * (w as f32 - 1.0) / scale, 192.0 - 0.5 * (h as f32 - 1.0) / scale),
-        ink: vec![black; w * h],
-    };
+pub(super) fn room(width: usize, height: usize, margin: usize, oversampling: usize, seed: u64) -> Scene {
+    let mut c = Canvas::new(width, height, margin, oversampling);
     let mut random = Random::new(seed, 0);
     let grain_seed = random.uniform(0.0, 1e6) as u32;
     wall(&mut c, grain_seed);
@@ -164,10 +18,9 @@ pub fn room(width: usize, height: usize, margin: usize, seed: u64) -> Scene {
     table(&mut c, grain_seed);
     plant(&mut c, &mut random);
     lamp(&mut c);
-    light(&c, margin)
+    light(&c, margin, oversampling)
 }
 
-const EVERYWHERE: Bounds = (-1e5, -1e5, 1e5, 1e5);
 const BULB: (f32, f32) = (268.0, 262.0);
 
 fn wall(c: &mut Canvas, seed: u32) {
@@ -175,9 +28,9 @@ fn wall(c: &mut Canvas, seed: u32) {
         EVERYWHERE,
         |_, _| -1.0,
         |x, y| {
-            let stripe = 0.5 + 0.5 * (x * std::f32::consts::TAU / 22.0).sin();
+            let stripe = 0.5 + 0.5 * (x * std::f32::consts::TAU / 22.0).sine();
             let (u, v) = ((x / 22.0).fract().abs() - 0.5, ((y + 11.0 * (x / 22.0).floor()) / 22.0).rem_euclid(1.0) - 0.5);
-            let flower = smooth(0.16, 0.10, u.hypot(v) * (1.0 + 0.35 * (5.0 * v.atan2(u)).sin()));
+            let flower = smooth(0.16, 0.10, u.length(v) * (1.0 + 0.35 * (5.0 * v.arctangent(u)).sine()));
             let tone = 0.85 + 0.3 * texture(x / 7.0, y / 7.0, seed) - 0.15 * smooth(0.4, 0.6, stripe);
             paint(times(mix([0.30, 0.36, 0.30], [0.52, 0.48, 0.30], flower), tone))
         },
@@ -186,7 +39,7 @@ fn wall(c: &mut Canvas, seed: u32) {
 
 fn window(c: &mut Canvas, random: &mut Random) {
     let (x0, y0, x1, y1) = (212.0, -8.0, 338.0, 158.0);
-    c.rect((x0 - 9.0, y0 - 9.0, x1 + 9.0, y1 + 9.0), |x, _| paint(times([0.62, 0.58, 0.5], 0.9 + 0.1 * (x * 0.9).sin())));
+    c.rect((x0 - 9.0, y0 - 9.0, x1 + 9.0, y1 + 9.0), |x, _| paint(times([0.62, 0.58, 0.5], 0.9 + 0.1 * (x * 0.9).sine())));
     c.rect((x0, y0, x1, y1), |_, y| {
         let t = (y - y0) / (y1 - y0);
         glow(mix([0.10, 0.20, 0.55], mix([0.35, 0.45, 0.75], [1.5, 0.72, 0.30], smooth(0.55, 1.0, t)), smooth(0.0, 0.8, t)))
@@ -224,9 +77,9 @@ fn window(c: &mut Canvas, random: &mut Random) {
     for (left, right, seed) in [(190.0, 222.0, 0.0), (328.0, 360.0, 2.0)] {
         c.draw(
             (left - 4.0, -200.0, right + 4.0, 190.0),
-            |x, y| (left - x).max(x - right - 2.0 * (y / 30.0 + seed).sin()).max(y - 184.0 - 2.0 * (x / 3.0).sin()),
+            |x, y| (left - x).max(x - right - 2.0 * (y / 30.0 + seed).sine()).max(y - 184.0 - 2.0 * (x / 3.0).sine()),
             |x, y| {
-                let fold = 0.55 + 0.45 * (x * 0.9 + 0.5 * (y / 40.0).sin()).sin();
+                let fold = 0.55 + 0.45 * (x * 0.9 + 0.5 * (y / 40.0).sine()).sine();
                 let weave = 0.8 + 0.4 * grain(x * 1.3, y * 1.3, 11);
                 paint(times([0.55, 0.09, 0.08], weave * (0.25 + 0.75 * fold)))
             },
@@ -251,10 +104,10 @@ fn chart(c: &mut Canvas) {
     c.rect((x0 + 8.0, y - 2.0, x1 - 8.0, y - 0.6), |_, _| paint([0.65, 0.03, 0.03]));
     let (sx, sy) = (x0 + 26.0, y + 19.0);
     c.disc(sx, sy, 17.0, |x, y| {
-        let a = (y - sy).atan2(x - sx);
+        let a = (y - sy).arctangent(x - sx);
         // The star blends into grey where its spokes are finer than the samples.
-        let sharp = (x - sx).hypot(y - sy) * 0.6;
-        paint([0.445 + 0.415 * ((18.0 * a).sin() * sharp).clamp(-1.0, 1.0); 3])
+        let sharp = (x - sx).length(y - sy) * 0.6;
+        paint([0.445 + 0.415 * ((18.0 * a).sine() * sharp).clamp(-1.0, 1.0); 3])
     });
     let mut x = x0 + 50.0;
     for period in [6.0f32, 4.0, 3.0] {
@@ -385,15 +238,15 @@ fn table(c: &mut Canvas, seed: u32) {
     // A mug with stripes.
     let stripe = |x: f32, y: f32| {
         let round = ((x - 352.0) / 17.0).clamp(-1.0, 1.0);
-        let red = smooth(-0.15, 0.15, ((y - 330.0) * 0.55).sin());
+        let red = smooth(-0.15, 0.15, ((y - 330.0) * 0.55).sine());
         Ink {
             light: 0.3 + 0.7 * (1.0 - round * round).sqrt() * (0.75 - 0.25 * round),
             ..paint(mix([0.75, 0.72, 0.66], [0.06, 0.20, 0.45], red))
         }
     };
-    c.draw((360.0, 322.0, 384.0, 352.0), |x, y| ((x - 369.0).hypot(y - 336.0) - 8.5).abs() - 1.9, |_, _| paint([0.6, 0.58, 0.52]));
+    c.draw((360.0, 322.0, 384.0, 352.0), |x, y| ((x - 369.0).length(y - 336.0) - 8.5).abs() - 1.9, |_, _| paint([0.6, 0.58, 0.52]));
     c.trapezium(352.0, (318.0, 17.0), (354.0, 14.5), stripe);
-    c.draw((334.0, 313.0, 370.0, 323.0), |x, y| ((x - 352.0).hypot(3.6 * (y - 318.0)) - 17.0) / 2.0, |_, _| paint([0.10, 0.06, 0.04]));
+    c.draw((334.0, 313.0, 370.0, 323.0), |x, y| ((x - 352.0).length(3.6 * (y - 318.0)) - 17.0) / 2.0, |_, _| paint([0.10, 0.06, 0.04]));
 }
 
 fn plant(c: &mut Canvas, random: &mut Random) {
@@ -407,8 +260,8 @@ fn plant(c: &mut Canvas, random: &mut Random) {
         .collect();
     leaves.sort_by(|a, b| a.3.total_cmp(&b.3));
     for &(angle, reach, long, tone) in &leaves {
-        let (x, y) = (root.0 + 0.85 * reach * angle.cos(), root.1 + reach * angle.sin() + 0.006 * reach * reach * angle.cos().abs());
-        let (co, si) = ((angle + 0.7 * angle.cos()).cos(), (angle + 0.7 * angle.cos()).sin());
+        let (x, y) = (root.0 + 0.85 * reach * angle.cosine(), root.1 + reach * angle.sine() + 0.006 * reach * reach * angle.cosine().abs());
+        let (co, si) = ((angle + 0.7 * angle.cosine()).cosine(), (angle + 0.7 * angle.cosine()).sine());
         c.line(root, (x, y), 0.4, paint([0.05, 0.09, 0.03]));
         let wide = 0.2 * long;
         c.draw(
@@ -420,7 +273,7 @@ fn plant(c: &mut Canvas, random: &mut Random) {
             },
             |u, v| {
                 let (p, q) = ((u - x) * co + (v - y) * si, (v - y) * co - (u - x) * si);
-                let vein = smooth(0.7, 0.25, q.abs()) + 0.5 * smooth(0.75, 0.95, ((p + q.abs()) * 1.6).sin());
+                let vein = smooth(0.7, 0.25, q.abs()) + 0.5 * smooth(0.75, 0.95, ((p + q.abs()) * 1.6).sine());
                 let side = if q > 0.0 { 1.0 } else { 0.7 };
                 Ink { light: tone.min(1.0), ..paint(times(mix([0.07, 0.24, 0.05], [0.26, 0.42, 0.13], vein.min(1.0)), side * tone)) }
             },
@@ -428,7 +281,7 @@ fn plant(c: &mut Canvas, random: &mut Random) {
     }
     c.trapezium(442.0, (298.0, 25.0), (340.0, 18.0), |x, y| {
         let round = ((x - 442.0) / 25.0).clamp(-1.0, 1.0);
-        let band = smooth(0.0, 0.3, ((y - 298.0) * 0.75).sin() * ((x - 442.0) * 0.45).sin());
+        let band = smooth(0.0, 0.3, ((y - 298.0) * 0.75).sine() * ((x - 442.0) * 0.45).sine());
         Ink {
             light: 0.25 + 0.75 * (1.0 - round * round).sqrt() * (0.7 - 0.3 * round),
             ..paint(mix([0.48, 0.17, 0.08], [0.70, 0.48, 0.25], band))
@@ -441,13 +294,13 @@ fn lamp(c: &mut Canvas) {
     c.rect((x - 2.0, y + 8.0, x + 2.0, 330.0), |u, _| paint(times([0.75, 0.55, 0.2], 0.4 + 0.6 * smooth(-2.0, 0.5, u - x))));
     c.draw(
         (x - 22.0, 322.0, x + 22.0, 336.0),
-        |u, v| ((u - x).hypot(3.4 * (v - 329.0)) - 20.0) / 2.5,
+        |u, v| ((u - x).length(3.4 * (v - 329.0)) - 20.0) / 2.5,
         |u, _| paint(times([0.75, 0.55, 0.2], 0.5 + 0.5 * smooth(-20.0, 4.0, u - x))),
     );
-    c.disc(x, y, 4.6, |u, v| glow(times([1.0, 0.78, 0.48], 40.0 * (1.25 - 0.06 * ((u - x).hypot(v - y)).powi(2)).max(0.2))));
+    c.disc(x, y, 4.6, |u, v| glow(times([1.0, 0.78, 0.48], 40.0 * (1.25 - 0.06 * ((u - x).length(v - y)).powi(2)).max(0.2))));
     c.trapezium(x, (206.0, 19.0), (256.0, 37.0), |u, v| {
         let near = 1.0 / (1.0 + ((u - x) / 26.0).powi(2) + ((v - 246.0) / 26.0).powi(2));
-        let pleat = 0.82 + 0.18 * ((u - x) / (19.0 + 18.0 * (v - 206.0) / 50.0) * 40.0).sin();
+        let pleat = 0.82 + 0.18 * ((u - x) / (19.0 + 18.0 * (v - 206.0) / 50.0) * 40.0).sine();
         let weave = 0.9 + 0.2 * grain(u * 1.5, v * 1.5, 51);
         glow(times([1.0, 0.60, 0.24], 1.7 * near * pleat * weave))
     });
@@ -455,7 +308,7 @@ fn lamp(c: &mut Canvas) {
         c.rect((x - half, v, x + half, v + 1.8), |_, _| glow([0.30, 0.13, 0.04]));
     }
     // A string of small bulbs across the wall: points that write the path of the hand into a shaken frame.
-    let wire = |x: f32| 190.0 + 0.0009 * (x - 300.0).powi(2) + 6.0 * (x / 31.0).sin();
+    let wire = |x: f32| 190.0 + 0.0009 * (x - 300.0).powi(2) + 6.0 * (x / 31.0).sine();
     for i in 0..200 {
         let u = 186.0 + 2.0 * i as f32;
         c.line((u, wire(u)), (u + 2.0, wire(u + 2.0)), 0.45, paint([0.02, 0.03, 0.02]));
@@ -472,28 +325,22 @@ fn lamp(c: &mut Canvas) {
 }
 
 /// Lights what was drawn: the lamp's two cones and its shade's glow, the dusk from the window, moonlight from behind.
-fn light(c: &Canvas, margin: usize) -> Scene {
-    let radiance: Vec<Colour> = (0..c.width * c.height)
-        .map(|i| {
-            let (x, y) = (c.origin.0 + (i % c.width) as f32 / c.scale, c.origin.1 + (i / c.width) as f32 / c.scale);
-            let ink = c.ink[i];
-            // The bulb hangs this far before the wall; inverse square times the cosine, 1 at the nearest point.
-            let away = 62.0;
-            let (dx, dy) = (x - BULB.0, y - BULB.1);
-            let r2 = dx * dx + dy * dy + away * away;
-            let falloff = away.powi(3) / r2.powf(1.5);
-            let up = smooth(0.50, 0.60, -(dy + 6.0) / r2.sqrt());
-            let down = smooth(0.10, 0.26, (dy + 2.0) / r2.sqrt());
-            let lamp = falloff * (0.16 + up.max(down));
-            let dusk = 0.035 * (1.0 / (1.0 + ((x - 275.0) / 120.0).powi(2) + ((y - 250.0) / 110.0).powi(2)));
-            let picture = 0.10 * smooth(90.0, 20.0, (x - 437.0).abs()) * smooth(330.0, 20.0, y) * smooth(-40.0, 30.0, y);
-            let lit: Colour = std::array::from_fn(|k| {
-                ink.light * (lamp * [1.0, 0.70, 0.40][k] + dusk * [0.8, 0.8, 1.0][k] + picture * [1.0, 0.88, 0.66][k])
-                    + 0.0025 * [0.7, 0.9, 1.3][k]
-            });
-            std::array::from_fn(|k| ink.albedo[k] * lit[k] + ink.emission[k] + 2e-5)
-        })
-        .collect();
-    let plane = |k: usize| Plane { width: c.width, height: c.height, data: radiance.iter().map(|p| p[k]).collect() };
-    Scene { samples: Rgb([plane(0), plane(1), plane(2)]), margin }
+fn light(c: &Canvas, margin: usize, oversampling: usize) -> Scene {
+    c.lit(margin, oversampling, |x, y, ink| {
+        // The bulb hangs this far before the wall; inverse square times the cosine, 1 at the nearest point.
+        let away = 62.0;
+        let (dx, dy) = (x - BULB.0, y - BULB.1);
+        let r2 = dx * dx + dy * dy + away * away;
+        let falloff = away.powi(3) / r2.power(1.5);
+        let up = smooth(0.50, 0.60, -(dy + 6.0) / r2.sqrt());
+        let down = smooth(0.10, 0.26, (dy + 2.0) / r2.sqrt());
+        let lamp = falloff * (0.16 + up.max(down));
+        let dusk = 0.035 * (1.0 / (1.0 + ((x - 275.0) / 120.0).powi(2) + ((y - 250.0) / 110.0).powi(2)));
+        let picture = 0.10 * smooth(90.0, 20.0, (x - 437.0).abs()) * smooth(330.0, 20.0, y) * smooth(-40.0, 30.0, y);
+        let lit: Colour = std::array::from_fn(|k| {
+            ink.light * (lamp * [1.0, 0.70, 0.40][k] + dusk * [0.8, 0.8, 1.0][k] + picture * [1.0, 0.88, 0.66][k])
+                + 0.0025 * [0.7, 0.9, 1.3][k]
+        });
+        std::array::from_fn(|k| ink.albedo[k] * lit[k] + ink.emission[k] + 2e-5)
+    })
 }

@@ -1,4 +1,11 @@
-//! What a photographer would do instead of deblurring: the plain weighted merge.
+//! What a photographer would do instead of deblurring all frames together: the plain weighted merge, exposure fusion, and each frame
+//! deblurred by itself.
+
+mod mertens;
+mod naive;
+
+pub use mertens::{fuse, fuse_images};
+pub use naive::deblur_each;
 
 use crate::exposure::Bracket;
 use crate::image::{Plane, Rgb};

@@ -1,0 +1,50 @@
+//! The program's own result on a bracket, in the form that experiments and baselines need.
+
+use crate::error::Result;
+use crate::exposure::Bracket;
+use crate::image::Rgb;
+use crate::pipeline::{self, Event, Settings};
+use crate::response::Response;
+use crate::tsf::{Tsf, TsfEntry, TsfFile};
+use serde_json::Value;
+
+/// What the program itself finds: irradiance per second, TSFs, the sharp frames.
+pub struct Joint {
+    /// Irradiance per second on the reference frame's grid.
+    pub irradiance: Rgb,
+    /// The TSF of each frame; the identity where none was found.
+    pub tsfs: Vec<Tsf>,
+    /// The frames (0-based) found to be sharp; without one the shortest.
+    pub sharp: Vec<usize>,
+    /// The merge's report.
+    pub report: Value,
+}
+
+impl Joint {
+    /// Runs the pipeline; arguments and errors are [`pipeline::merge`]'s.
+    ///
+    /// # Errors
+    /// Those of the pipeline.
+    pub fn new(
+        bracket: &Bracket,
+        response: &Response,
+        settings: &Settings,
+        tsf: Option<&TsfFile>,
+        events: &mut dyn FnMut(Event) -> bool,
+    ) -> Result<Self> {
+        let outcome = pipeline::merge(bracket, response, settings, tsf, events)?;
+        let seconds = bracket.frames()[outcome.reference].exposure_time as f32;
+        let entries = outcome.report["frames"].as_array().cloned().unwrap_or_default();
+        let found = |e: &Value| {
+            let entry: Option<TsfEntry> = serde_json::from_value(e["tsf"].clone()).ok();
+            let tsf = entry.map(|e| TsfFile::new(vec![e.clone()]).find(&e.frame, e.width, e.height));
+            tsf.and_then(|t| t.ok().flatten()).unwrap_or_else(Tsf::identity)
+        };
+        let tsfs = entries.iter().map(found).collect();
+        let sharp: Vec<usize> = (0..entries.len()).filter(|&i| entries[i]["sharp"].as_bool() == Some(true)).collect();
+        // Without a sharp frame the shortest is the least shaken.
+        let all: Vec<usize> = (0..entries.len()).collect();
+        let sharp = if sharp.is_empty() { bracket.shortest(&all).into_iter().collect() } else { sharp };
+        Ok(Self { irradiance: outcome.irradiance.map_planes(|p| p.map(|v| v / seconds)), tsfs, sharp, report: outcome.report })
+    }
+}
