@@ -50,11 +50,15 @@ const TABLE: &[(&str, &[&str])] = &[
     ),
     // Brackets with known truth: never an estimator.
     ("synth", &["error", "image", "pose", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    // Colours.
+    ("colour", &["image"]),
+    // What a result rests on.
+    ("layers", &["image", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
     // The edges of the program.
-    ("io", &["error", "image", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    ("io", &["error", "image", "colour", "mask::CLIPPED", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
     (
         "cli",
         &[
@@ -64,6 +68,9 @@ const TABLE: &[(&str, &[&str])] = &[
             "noise::NoiseModel",
             "response",
             "baseline",
+            "colour",
+            "layers",
+            "mask",
             "io",
             "pipeline",
             "metrics",

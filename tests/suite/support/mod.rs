@@ -2,6 +2,7 @@
 
 pub mod files;
 pub mod gpu;
+pub mod photos;
 
 /// Numbers of -1..1 from a fixed seed (splitmix64).
 pub fn noise(seed: u64, count: usize) -> Vec<f32> {
