@@ -118,7 +118,7 @@ fn the_report_page_shows_and_its_slider_moves() {
     for kind in ["mousePressed", "mouseReleased"] {
         browser.call("Input.dispatchMouseEvent", json!({ "type": kind, "x": x, "y": y, "button": "left", "clickCount": 1 }));
     }
-    let place = browser.value("parseFloat(document.getElementById('handle').value)").as_f64().or_else(|| None);
+    let place = browser.value("parseFloat(document.getElementById('handle').value)").as_f64();
     assert!(place.is_some_and(|v| (v - 200.0).abs() < 25.0), "the handle is at {place:?} of 1000");
     let after = browser.screenshot();
     let changed = |from: f64, to: f64| {
