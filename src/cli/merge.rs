@@ -22,12 +22,12 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
     let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
-    let photo = PhotoSettings::of(args)?;
     frames::check(&args.frames)?;
     let word = args.response.as_deref().filter(|r| *r != "auto");
     let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
     let response_file = word.filter(|_| named.is_none()).map(Path::new);
     let targets = outputs(args, response_file)?;
+    let photo = PhotoSettings::of(args)?;
 
     let given = match (named, response_file) {
         (None, Some(path)) => Some(read_response(path)?),
