@@ -14,6 +14,7 @@
 
 pub mod baseline;
 pub mod cli;
+pub mod colour;
 pub mod deblur;
 pub mod error;
 pub mod experiments;
@@ -23,6 +24,7 @@ pub mod gpu;
 pub mod image;
 pub mod io;
 pub mod kernels;
+pub mod layers;
 pub mod mask;
 pub mod merge;
 pub mod metrics;

@@ -5,10 +5,10 @@ use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::kernels::NOISE_STEPS;
 use crate::response::Response;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Shot and read noise of a camera at one sensitivity, in units of the exposure (1 = white).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NoiseModel {
     /// Variance per unit of exposure: one over the full well in electrons.
     pub shot: f64,

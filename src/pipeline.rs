@@ -83,6 +83,8 @@ pub struct Outcome {
     pub reference: usize,
     /// Names of frames that the program, not the user, left out, and why.
     pub left_out: Vec<(String, String)>,
+    /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
+    pub misfit: Vec<Option<Plane>>,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
     pub report: Value,
 }
@@ -616,7 +618,11 @@ impl Run<'_> {
             "solver": solution.report,
             "timings_s": std::mem::take(&mut self.timings),
         });
-        Ok(Outcome { irradiance, reference, left_out: self.left_out, report })
+        let mut misfit: Vec<Option<Plane>> = vec![None; frames.len()];
+        for (&i, plane) in all.iter().zip(solution.misfit) {
+            misfit[i] = Some(plane);
+        }
+        Ok(Outcome { irradiance, reference, left_out: self.left_out, misfit, report })
     }
 }
 

@@ -5,6 +5,12 @@
 //! F. Durand, "A Fast Approximation of the Bilateral Filter", 2006); then a shoulder (E. Reinhard et al., "Photographic Tone
 //! Reproduction for Digital Images", 2002, eq. 4) and the sRGB curve.
 
+mod fattal;
+mod filter;
+mod operator;
+
+pub use operator::Operator;
+
 use crate::image::{Plane, Rgb};
 use rayon::prelude::*;
 
@@ -137,10 +143,8 @@ fn bilateral(log: &Plane, sigma: f32, range: f32) -> Plane {
             });
         }
     }
-    let mut i = 0;
-    log.map(|v| {
+    let slice = |(i, &v): (usize, &f32)| {
         let (gx, gy, gz) = place(i % log.width, i / log.width, v);
-        i += 1;
         let (x, y, z) = (gx as usize, gy as usize, gz as usize);
         let (a, b, c) = (gx - x as f32, gy - y as f32, gz - z as f32);
         let (mut sum, mut count) = (0.0, 0.0);
@@ -154,5 +158,6 @@ fn bilateral(log: &Plane, sigma: f32, range: f32) -> Plane {
             }
         }
         if count > 1e-12 { sum / count } else { v }
-    })
+    };
+    Plane { width: log.width, height: log.height, data: log.data.par_iter().enumerate().map(slice).collect() }
 }

@@ -5,11 +5,31 @@ use std::path::PathBuf;
 
 /// Turns a hand-held exposure bracket with camera shake into one sharp HDR irradiance image.
 #[derive(Debug, Parser)]
-#[command(name = "unshaken", version, about)]
+#[command(name = "unshaken", version, about, after_help = EXAMPLES)]
 pub(super) struct CommandLine {
     #[command(subcommand)]
     pub command: Command,
+    #[command(flatten)]
+    pub session: SessionArgs,
 }
+
+/// What every command understands.
+#[derive(Debug, Args)]
+pub(super) struct SessionArgs {
+    /// Say nothing but errors
+    #[arg(long, global = true, conflicts_with = "json", help_heading = "Output of the program")]
+    pub quiet: bool,
+    /// Tell progress, warnings and results as JSON lines on standard output
+    #[arg(long, global = true, help_heading = "Output of the program")]
+    pub json: bool,
+}
+
+const EXAMPLES: &str = "Examples:
+  unshaken demo
+  unshaken merge -o night.exr --preview night.png IMG_1.jpg IMG_2.jpg IMG_3.jpg
+  unshaken merge -o night.exr --report-html night.html IMG_*.dng
+  unshaken tonemap night.exr -o night.jpg --tonemap reinhard-local:key=0.22
+  unshaken batch photos/ --output-dir merged --dry-run";
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Command {
@@ -29,21 +49,30 @@ pub(super) enum Command {
     Experiment(super::experiment::ExperimentArgs),
     /// List the GPU adapters and the one that would be used
     Adapters,
+    /// Make a picture for the screen from a linear image
+    Tonemap(TonemapArgs),
+    /// Find the brackets among many photographs and merge each
+    Batch(BatchArgs),
+    /// Print the completions of a shell, or the manual page
+    Generate(GenerateArgs),
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = MERGE_EXAMPLES)]
 pub(super) struct MergeArgs {
-    /// Frames of one scene (PNG, JPEG or TIFF, 8 or 16 bits), counted from 1
+    /// Frames of one scene (camera raw, JPEG, PNG, TIFF, OpenEXR or Radiance HDR), counted from 1
     #[arg(required = true, value_name = "FRAME")]
     pub frames: Vec<PathBuf>,
-    /// Irradiance as linear 32-bit float OpenEXR; 1.0 is the white of the reference frame
+    /// Linear irradiance as OpenEXR, Radiance .hdr or TIFF, by the name's ending; 1.0 is the white of the reference frame
     #[arg(short, long, value_name = "OUT.exr")]
     pub output: PathBuf,
+    #[command(flatten)]
+    pub photo: PhotoArgs,
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
-    /// Camera response: srgb, linear, gamma:2.2, a file from 'unshaken calibrate', or auto (from these frames) [default: auto for
-    /// JPEG, srgb with a warning for PNG and TIFF]
+    /// Camera response: srgb, linear, gamma:2.2, a file from 'unshaken calibrate', or auto (from these frames) [default: what raw files
+    /// and profiles of PNG and TIFF files state; auto for JPEG; else srgb with a warning]
     #[arg(long, value_name = "NAME|FILE.json")]
     pub response: Option<String>,
     /// Frame on whose pixel grid the result lies [default: the longest sharp frame]
@@ -58,7 +87,7 @@ pub(super) struct MergeArgs {
     /// Take the frames as they lie, without registering them against each other
     #[arg(long)]
     pub no_align: bool,
-    /// Exit with code 3 when a frame had to be left out (what the others give is written all the same)
+    /// Exit with code 3 when a frame was left out or nothing could be deblurred (what there is is written all the same)
     #[arg(long)]
     pub strict: bool,
     /// Alpha of the Tukey window over intensity, 0 to 1: the part of the range where weights taper off [default: 0.3]
@@ -89,8 +118,8 @@ pub(super) struct MergeArgs {
     /// Most GPU memory to use, such as 2GiB or 800MiB; less is slower [default: all there is]
     #[arg(long, value_name = "SIZE", allow_hyphen_values = true)]
     pub memory_limit: Option<String>,
-    /// Write a tone-mapped picture of the result
-    #[arg(long, value_name = "OUT.png")]
+    /// Write a tone-mapped picture of the result, as PNG or JPEG by the name's ending
+    #[arg(long, value_name = "OUT.png|OUT.jpg")]
     pub preview: Option<PathBuf>,
     /// Write everything that was estimated and how well it fits
     #[arg(long, value_name = "OUT.json")]
@@ -98,6 +127,129 @@ pub(super) struct MergeArgs {
     /// Replace outputs that exist
     #[arg(long)]
     pub overwrite: bool,
+}
+
+const MERGE_EXAMPLES: &str = "Examples:
+  unshaken merge -o night.exr --preview night.png IMG_1.jpg IMG_2.jpg IMG_3.jpg
+  unshaken merge -o night.exr --exposures 1/30,1/8,0.5,2 --response camera.json a.png b.png c.png d.png
+  unshaken merge -o night.exr --primaries rec2020 --half --report-html night.html IMG_*.dng
+
+Exit codes: 0 done, 1 failed, 2 wrong command line, 3 done but degraded (with --strict), 130 interrupted.";
+
+/// Photographers' files: what goes in, what comes out.
+#[derive(Debug, Args)]
+pub(super) struct PhotoArgs {
+    /// Relative exposures in EV in the order of the frames, such as -2,0,2, instead of times
+    #[arg(long, value_name = "EV,EV,...", allow_hyphen_values = true, conflicts_with = "exposures")]
+    pub ev: Option<String>,
+    /// Value of floating-point frames (OpenEXR, Radiance HDR, TIFF) from which they are clipped [default: 1]
+    #[arg(long, value_name = "V", allow_hyphen_values = true)]
+    pub white: Option<String>,
+    /// Primaries of the result: rec709, rec2020, p3 or acescg [default: rec709]
+    #[arg(long, value_name = "NAME", help_heading = "Result")]
+    pub primaries: Option<String>,
+    /// Write 16 bits: half floats in OpenEXR, integers in TIFF [default: 32-bit float]
+    #[arg(long, help_heading = "Result")]
+    pub half: bool,
+    /// Pixel values are cd/m2, from aperture, ISO speed and exposure time of the reference frame
+    #[arg(long, help_heading = "Result")]
+    pub absolute: bool,
+    /// Add channels to the OpenEXR file: confidence, saturation, residual, weight of each frame
+    #[arg(long, help_heading = "Result")]
+    pub layers: bool,
+    /// Tone mapping of --preview: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1 [default: filmic]
+    #[arg(long, value_name = "OP[:NAME=V,...]", help_heading = "Result")]
+    pub tonemap: Option<String>,
+    /// Write one page (HTML) that shows everything: before and after, frames, masks, blur, residuals, settings
+    #[arg(long, value_name = "OUT.html", help_heading = "Result")]
+    pub report_html: Option<PathBuf>,
+    /// Options from a TOML file [default: unshaken/config.toml in the user's configuration folder, where it exists]
+    #[arg(long, value_name = "FILE.toml", help_heading = "Settings")]
+    pub config: Option<PathBuf>,
+    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: fast, archive
+    #[arg(long, value_name = "NAME", help_heading = "Settings")]
+    pub preset: Option<String>,
+    /// Print the options that are in force, as a configuration file, and stop
+    #[arg(long, help_heading = "Settings")]
+    pub print_config: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct TonemapArgs {
+    /// Linear image: OpenEXR, Radiance HDR or floating-point TIFF
+    #[arg(value_name = "IN.exr")]
+    pub input: PathBuf,
+    /// Picture: PNG or JPEG, by the name's ending
+    #[arg(short, long, value_name = "OUT.png|OUT.jpg")]
+    pub output: PathBuf,
+    /// Operator: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1,saturation=0.9
+    #[arg(long, value_name = "OP[:NAME=V,...]", default_value = "filmic")]
+    pub tonemap: String,
+    /// Quality of a JPEG, 1 to 100
+    #[arg(long, value_name = "N", default_value_t = 92, value_parser = clap::value_parser!(u8).range(1..=100))]
+    pub quality: u8,
+    /// Replace an output that exists
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+/// Options of 'merge' come beside these.
+#[derive(Debug, Args)]
+#[command(after_help = BATCH_EXAMPLES)]
+pub(super) struct BatchArgs {
+    /// Photographs, and folders whose photographs are meant
+    #[arg(required_unless_present = "manifest", value_name = "DIR|FILE")]
+    pub photographs: Vec<PathBuf>,
+    /// Folder for the results, which is made if need be
+    #[arg(long, value_name = "OUT")]
+    pub output_dir: PathBuf,
+    /// Print the brackets that were found, as a manifest, and stop
+    #[arg(long)]
+    pub dry_run: bool,
+    /// The brackets, instead of finding them (TOML; --dry-run prints one)
+    #[arg(long, value_name = "FILE.toml")]
+    pub manifest: Option<PathBuf>,
+    /// Longest pause in seconds between the end of one frame and the next of its bracket
+    #[arg(long, value_name = "S", default_value_t = 3.0)]
+    pub gap: f64,
+    /// Brackets that are merged at a time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    pub jobs: u16,
+    /// Only every Nth bracket, beginning with the Ith (counted from 1), so that N machines share the work
+    #[arg(long, value_name = "I/N")]
+    pub shard: Option<String>,
+    /// Merge again what is done already
+    #[arg(long)]
+    pub again: bool,
+}
+
+const BATCH_EXAMPLES: &str = "Examples:
+  unshaken batch photos/ --output-dir merged --dry-run > brackets.toml
+  unshaken batch --manifest brackets.toml --output-dir merged --jobs 2 --response camera.json
+  unshaken batch photos/ --output-dir merged --shard $SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT
+
+Each bracket's result is OUT/NAME.exr with NAME.jpg and NAME.json beside it. What is finished is skipped when its frames and options are
+the same. Options of 'merge' that are about one bracket's frames apply to all.
+
+Exit codes: 0 all done, 1 some failed, 2 wrong command line, 3 none failed but some are degraded (with --strict), 130 interrupted.";
+
+#[derive(Debug, Args)]
+pub(super) struct GenerateArgs {
+    /// What to print
+    #[arg(value_enum)]
+    pub what: Generate,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+pub(super) enum Generate {
+    /// Completions for bash
+    Bash,
+    /// Completions for zsh
+    Zsh,
+    /// Completions for fish
+    Fish,
+    /// The manual page (roff)
+    Man,
 }
 
 #[derive(Debug, Args)]

@@ -46,6 +46,7 @@ pub(super) fn run(args: &CalibrateArgs) -> anyhow::Result<()> {
     };
     target.stage_json(&ResponseFile::new(&response, provenance))?.commit()?;
     drop(progress);
-    println!("wrote {} (response from {})", args.output.display(), frames::count(args.frames.len(), "frame"));
+    let text = format!("wrote {} (response from {})", args.output.display(), frames::count(args.frames.len(), "frame"));
+    super::progress::done(&text, serde_json::json!({ "output": args.output }));
     Ok(())
 }

@@ -1,9 +1,13 @@
 //! Frames and their exposure times from the command line.
 
 use super::Usage;
+use crate::colour::Matrix;
 use crate::error::Error;
 use crate::exposure::{Bracket, Frame};
-use crate::io::{ldr, metadata, output};
+use crate::io::input::{self, Encoding, Input};
+use crate::io::metadata::{self, Metadata};
+use crate::io::output;
+use crate::response::Response;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -75,29 +79,98 @@ pub(super) fn exposure_times(list: &str, paths: &[PathBuf]) -> Result<Vec<f64>, 
         .collect()
 }
 
-/// Reads the frames as a bracket; times that are not `given` come from the files.
-pub(super) fn read(paths: &[PathBuf], given: Option<Vec<f64>>) -> crate::error::Result<Bracket> {
-    let times = match given {
-        Some(times) => times,
-        None => paths.iter().map(|p| noted_time(p)).collect::<Result<_, _>>()?,
+/// The relative exposures of `--ev`, one step per frame, as times: 2^EV.
+pub(super) fn exposure_values(list: &str, paths: &[PathBuf]) -> Result<Vec<f64>, Usage> {
+    let words: Vec<&str> = list.split(',').map(str::trim).collect();
+    if words.len() != paths.len() {
+        let (given, frames) = (count(words.len(), "value"), count(paths.len(), "frame"));
+        return Err(Usage(format!("--ev: {given} for {frames}; give one exposure in EV per frame, in their order")));
+    }
+    let value = |(i, word): (usize, &&str)| match word.parse::<f64>() {
+        Ok(v) if v.abs() <= 40.0 => Ok(v.exp2()),
+        _ => {
+            let name = paths[i].display();
+            Err(Usage(format!("--ev: {word:?} for frame {} ({name}) is not an exposure; give EV such as -2 or +1.5", i + 1)))
+        }
     };
-    let pictures = paths.par_iter().map(|p| ldr::read(p)).collect::<Vec<_>>();
-    let frames = pictures.into_iter().zip(names(paths)).zip(times).map(|((picture, name), exposure_time)| {
-        let ldr::Picture { intensity, levels } = picture?;
-        Ok(Frame { name, intensity, levels, exposure_time })
-    });
-    Bracket::new(frames.collect::<Result<_, Error>>()?)
+    words.iter().enumerate().map(value).collect()
 }
 
-fn noted_time(path: &Path) -> crate::error::Result<f64> {
-    const REMEDY: &str = "give the times of all frames with --exposures";
-    match metadata::exposure_time(path)? {
-        Some(t) if t.is_finite() && t > 0.0 => Ok(t),
-        Some(t) => {
-            Err(Error::Format { path: path.into(), reason: format!("EXIF notes an exposure time of {t} s, which cannot be; {REMEDY}") })
-        }
-        None => Err(Error::Format { path: path.into(), reason: format!("holds no exposure time (EXIF); {REMEDY}") }),
+/// Frames that are read, and what their files say that pixels do not.
+pub(super) struct Loaded {
+    pub bracket: Bracket,
+    /// The response that the files themselves state; `None` for a camera's own curve.
+    pub stated: Option<(String, Response)>,
+    /// Of each frame, linear RGB to XYZ relative to D50.
+    pub to_xyz: Vec<Matrix>,
+    pub metadata: Vec<Metadata>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// Reads the frames as a bracket; times that are not `given` come from the files.
+pub(super) fn read(paths: &[PathBuf], given: Option<Vec<f64>>) -> crate::error::Result<Bracket> {
+    load(paths, given, 1.0).map(|l| l.bracket)
+}
+
+/// Reads the frames with all that their files say. `white`: see [`input::read`].
+pub(super) fn load(paths: &[PathBuf], given: Option<Vec<f64>>, white: f32) -> crate::error::Result<Loaded> {
+    // Exposures that will be refused need no pixels, for the kinds of files whose notes are quickly read.
+    if given.is_none() && !paths.iter().any(|p| input::notes_need_pixels(p)) {
+        let noted = paths.iter().map(|p| metadata::read(p)).collect::<crate::error::Result<Vec<_>>>()?;
+        metadata::exposures(&pairs(paths, &noted))?;
     }
+    let inputs = paths.par_iter().map(|p| input::read(p, white)).collect::<Vec<_>>();
+    let inputs = inputs.into_iter().collect::<crate::error::Result<Vec<Input>>>()?;
+    let mut notes = Vec::new();
+    let times = match given {
+        Some(times) => times,
+        None => {
+            let noted: Vec<_> = inputs.iter().map(|i| i.metadata.clone()).collect();
+            let (times, more) = metadata::exposures(&pairs(paths, &noted))?;
+            notes.extend(more);
+            times
+        }
+    };
+    let kind = |e: &Encoding| match e {
+        Encoding::Camera => "in the camera's curve".to_string(),
+        Encoding::Profile(name, _) => format!("in the curve of its profile \"{name}\""),
+        Encoding::Linear => "linear".to_string(),
+    };
+    let first = &inputs[0];
+    for (path, other) in paths.iter().zip(&inputs).skip(1) {
+        if other.encoding != first.encoding {
+            let (a, b) = (kind(&other.encoding), kind(&first.encoding));
+            let reason = format!("is {a} but {} is {b}; give frames of one kind", paths[0].display());
+            return Err(Error::Format { path: path.clone(), reason });
+        }
+        if !input::same_colours(&other.to_xyz, &first.to_xyz) {
+            if !other.raw {
+                let reason = format!("has other primaries than {}; convert both to one colour space", paths[0].display());
+                return Err(Error::Format { path: path.clone(), reason });
+            }
+            let note = "the frames' white balances differ; that of the reference frame is used for all";
+            if !notes.iter().any(|n| n == note) {
+                notes.push(note.to_string());
+            }
+        }
+    }
+    let stated = match &first.encoding {
+        Encoding::Camera => None,
+        Encoding::Profile(name, response) => Some((format!("profile {name}"), response.clone())),
+        Encoding::Linear => Some(("linear".to_string(), Response::Linear)),
+    };
+    let (mut frames, mut to_xyz, mut metadata) = (Vec::new(), Vec::new(), Vec::new());
+    for ((input, name), exposure_time) in inputs.into_iter().zip(names(paths)).zip(times) {
+        frames.push(Frame { name, intensity: input.intensity, levels: input.levels, exposure_time });
+        to_xyz.push(input.to_xyz);
+        metadata.push(input.metadata);
+    }
+    Ok(Loaded { bracket: Bracket::new(frames)?, stated, to_xyz, metadata, notes })
+}
+
+fn pairs<'a>(paths: &[PathBuf], noted: &'a [Metadata]) -> Vec<(PathBuf, &'a Metadata)> {
+    paths.iter().cloned().zip(noted).collect()
 }
 
 /// "1 frame", "3 frames".

@@ -1,29 +1,36 @@
 //! `unshaken merge`.
 
 use super::args::MergeArgs;
-use super::{Done, Usage, frames, with_progress};
+use super::progress::done;
+use super::{Done, Usage, frames, interrupt, page, with_progress};
+use crate::colour::{self, Primaries};
 use crate::error::Error;
 use crate::exposure::Bracket;
-use crate::io::exr::Radiometry;
+use crate::io::exr::{self, Radiometry};
 use crate::io::output::{self, Output};
+use crate::layers;
 use crate::noise::NoiseModel;
 use crate::pipeline::{self, Event, Settings};
 use crate::response::{Response, ResponseFile};
+use crate::tonemap::Operator;
 use crate::tsf::{Interpolation, Model, TsfFile};
+use serde_json::json;
 use std::path::{Path, PathBuf};
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
+    let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
     let settings = settings(args)?;
     let divisor = args.scale.as_deref().map_or(Ok(1), divisor)?;
     frames::check(&args.frames)?;
-    let given = args.response.as_deref().filter(|r| *r != "auto");
-    let named = given.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
-    let response_file = given.filter(|_| named.is_none()).map(Path::new);
-    let (exr, preview, report) = outputs(args, response_file)?;
+    let word = args.response.as_deref().filter(|r| *r != "auto");
+    let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
+    let response_file = word.filter(|_| named.is_none()).map(Path::new);
+    let targets = outputs(args, response_file)?;
+    let photo = PhotoSettings::of(args)?;
 
-    let response = match (named, response_file) {
+    let given = match (named, response_file) {
         (None, Some(path)) => Some(read_response(path)?),
         (named, _) => named,
     };
@@ -32,13 +39,43 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         check_tsf_names(file, path, &args.frames)?;
     }
 
-    let (text, left_out) = with_progress(|events| {
+    let (text, quality) = with_progress(|events| {
         events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
-        let bracket = frames::read(&args.frames, times)?;
+        let mut loaded = frames::load(&args.frames, times.clone().or(values), photo.white)?;
+        if times.is_some() {
+            for (noted, frame) in loaded.metadata.iter_mut().zip(loaded.bracket.frames()) {
+                noted.exposure_time = Some(frame.exposure_time);
+            }
+        }
+        let frames::Loaded { bracket, stated, to_xyz, metadata, notes } = loaded;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
-        let (response, origin) = super::response::choose(args, response, &bracket, events)?;
+        for note in &notes {
+            events(Event::Warning(note.clone()));
+        }
+        if args.photo.absolute
+            && let Some(i) = metadata.iter().position(|m| m.white_luminance().is_none())
+        {
+            let name = &bracket.frames()[i].name;
+            return Err(Usage(format!(
+                "--absolute: {name} does not note aperture, ISO speed and exposure time (EXIF); leave --absolute out"
+            ))
+            .into());
+        }
+        let linear = matches!(&stated, Some((_, Response::Linear)));
+        if linear && let Some(word) = args.response.as_deref().filter(|w| *w != "linear") {
+            return Err(Usage(format!("--response {word}: the frames are linear already; leave --response out")).into());
+        }
+        // A camera's JPEG has a tone curve of its own whatever its profile says.
+        let jpeg = args.frames.iter().all(|p| ["jpg", "jpeg"].contains(&output::ending(p).as_str()));
+        let stated = stated.filter(|_| linear || !jpeg && args.response.as_deref() != Some("auto"));
+        let (stated_by, stated) = stated.map_or((None, None), |(what, response)| (Some(what), Some(response)));
+        let by_file = given.is_none().then_some(stated_by).flatten();
+        let (response, mut origin) = super::response::choose(args, given.or(stated), &bracket, events)?;
+        if let Some(what) = by_file {
+            origin["origin"] = json!(format!("stated by the files: {what}"));
+        }
         if args.frames.len() == settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
@@ -53,35 +90,184 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
         let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
         let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
-        let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), events)?;
+        let mut degraded = Vec::new();
+        let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), &mut |event| {
+            if let Event::Warning(text) = &event {
+                degraded.push(text.clone());
+            }
+            events(event)
+        })?;
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
 
-        outcome.report["response"] = origin;
+        let reference = &bracket.frames()[outcome.reference];
+        let noted = &metadata[outcome.reference];
+        let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
+        let layers = if args.photo.layers { layers::layers(&bracket, &response, &outcome) } else { Vec::new() };
+        let own = &to_xyz[outcome.reference];
+        let in_primaries = |primaries: Primaries| {
+            let mut image = outcome.irradiance.clone();
+            let back = colour::inverse(&primaries.to_xyz()).expect("standard primaries");
+            let outside = colour::convert(&mut image, &colour::product(&back, own));
+            (image, outside)
+        };
+        let (mut linear, outside) = in_primaries(photo.primaries);
+        if outside > OUTSIDE {
+            events(Event::Warning(format!(
+                "{:.1} % of the pixels have colours outside {}, which lose saturation; --primaries rec2020 or acescg holds them",
+                100.0 * outside,
+                photo.primaries.name()
+            )));
+        }
+        let absolute = args.photo.absolute.then(|| noted.white_luminance()).flatten();
+        if let Some(white) = absolute {
+            linear = linear.map_planes(|p| p.map(|v| v * white as f32));
+        }
+        if let Some(report) = outcome.report.as_object_mut() {
+            report.insert("response".into(), origin);
+            report.insert("exposure_notes".into(), json!(notes));
+            report.insert("warnings".into(), json!(degraded));
+            report.insert(
+                "colour".into(),
+                json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),
+            );
+        }
 
         // All are complete before the first is renamed.
-        let reference = &bracket.frames()[outcome.reference];
-        let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
-        let mut staged = vec![exr.stage_exr(&outcome.irradiance, &radiometry)?];
-        if let Some(target) = &preview {
-            staged.push(target.stage_png(&crate::tonemap::preview(&outcome.irradiance))?);
+        let style = exr::Style { primaries: photo.primaries, half: args.photo.half, metadata: noted.clone(), absolute, layers };
+        let (staged, clipped) = targets.linear.stage_linear(&linear, &radiometry, &style)?;
+        if clipped > OUTSIDE {
+            events(Event::Warning(format!(
+                "{:.1} % of the values are above 1, which 16-bit integers clip; leave --half out, or write OpenEXR",
+                100.0 * clipped
+            )));
         }
-        if let Some(target) = &report {
+        let mut staged = vec![staged];
+        if targets.preview.is_some() || targets.page.is_some() {
+            let display = in_primaries(Primaries::Rec709).0;
+            if let Some(target) = &targets.preview {
+                staged.push(target.stage_picture(&photo.operator.apply(&display), JPEG_QUALITY, noted)?);
+            }
+            if let Some(target) = &targets.page {
+                let page = page::Page {
+                    bracket: &bracket,
+                    response: &response,
+                    outcome: &outcome,
+                    display: &display,
+                    to_display: colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries"), own),
+                    warnings: &degraded,
+                    settings: photo.listing(args),
+                };
+                staged.push(target.stage_text(&page.html())?);
+            }
+        }
+        if let Some(target) = &targets.report {
             staged.push(target.stage_json(&outcome.report)?);
         }
-        for file in staged {
-            file.commit()?;
+        if interrupt::asked() {
+            return Err(Error::Cancelled.into());
         }
-        Ok((summary(args, &bracket, outcome.reference), outcome.left_out))
+        output::commit_all(staged)?;
+        let quality = if degraded.is_empty() { Done::AsAsked } else { Done::Degraded };
+        Ok((summary(args, &bracket, outcome.reference), quality))
     })?;
-    println!("{text}");
-    Ok(if args.strict && !left_out.is_empty() { Done::Degraded } else { Done::AsAsked })
+    done(&text, json!({ "output": args.output, "degraded": quality == Done::Degraded }));
+    Ok(if args.strict { quality } else { Done::AsAsked })
+}
+
+/// Quality of a JPEG preview.
+const JPEG_QUALITY: u8 = 92;
+/// Share of the pixels from which a loss is worth a warning.
+const OUTSIDE: f64 = 1e-3;
+
+/// The options of photographers' files, understood.
+struct PhotoSettings {
+    white: f32,
+    primaries: Primaries,
+    operator: Operator,
+}
+
+impl PhotoSettings {
+    fn of(args: &MergeArgs) -> Result<Self, Usage> {
+        let photo = &args.photo;
+        let white = match &photo.white {
+            None => 1.0,
+            Some(word) => word
+                .parse()
+                .ok()
+                .filter(|v: &f32| v.is_finite() && *v > 0.0)
+                .ok_or_else(|| Usage(format!("--white: {word:?} is not a positive number")))?,
+        };
+        let primaries = match &photo.primaries {
+            None => Primaries::default(),
+            Some(word) => Primaries::named(word)
+                .ok_or_else(|| Usage(format!("--primaries: {word:?} is none of {}", Primaries::ALL.map(Primaries::name).join(", "))))?,
+        };
+        let operator = match &photo.tonemap {
+            None => Operator::default(),
+            Some(words) => Operator::parse(words).map_err(|e| Usage(format!("--tonemap: {e}")))?,
+        };
+        let ending = output::ending(&args.output);
+        let refuse = |option: &str, why: &str| Err(Usage(format!("{option}: {why}")));
+        match ending.as_str() {
+            "exr" | "tif" | "tiff" => {}
+            "hdr" if photo.half => return refuse("--half", "Radiance HDR has one depth; leave --half out"),
+            "hdr" if primaries != Primaries::Rec709 => return refuse("--primaries", "Radiance HDR is Rec. 709; write OpenEXR or TIFF"),
+            "hdr" => {}
+            _ => return refuse("--output", "the name ends with neither .exr, .hdr, .tif nor .tiff; name the format by the ending"),
+        }
+        if photo.layers && ending != "exr" {
+            return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
+        }
+        if photo.tonemap.is_some() && args.preview.is_none() {
+            return refuse("--tonemap", "is for the picture of --preview; name one");
+        }
+        if let Some(path) = &args.preview {
+            check_picture_name("--preview", path)?;
+        }
+        Ok(Self { white, primaries, operator })
+    }
+
+    /// All settings of a run, as the page lists them.
+    fn listing(&self, args: &MergeArgs) -> Vec<(String, String)> {
+        let or = |v: &Option<String>, d: &str| v.clone().unwrap_or_else(|| d.to_string());
+        let set = |v: bool| if v { "yes" } else { "no" }.to_string();
+        vec![
+            ("--output".into(), args.output.display().to_string()),
+            ("--exposures".into(), or(&args.exposures, "from EXIF")),
+            ("--ev".into(), or(&args.photo.ev, "-")),
+            ("--response".into(), or(&args.response, "as the files state, else auto for JPEG, srgb otherwise")),
+            ("--reference".into(), or(&args.reference, "longest sharp frame")),
+            ("--sharp".into(), or(&args.sharp, "found out")),
+            ("--exclude".into(), or(&args.exclude, "none")),
+            ("--alpha".into(), or(&args.alpha, "0.3")),
+            ("--tsf".into(), args.tsf.as_ref().map_or("estimated".into(), |p| p.display().to_string())),
+            ("--white".into(), self.white.to_string()),
+            ("--primaries".into(), self.primaries.name().into()),
+            ("--half".into(), set(args.photo.half)),
+            ("--absolute".into(), set(args.photo.absolute)),
+            ("--layers".into(), set(args.photo.layers)),
+            ("--tonemap".into(), self.operator.to_string()),
+            ("--no-align".into(), set(args.no_align)),
+            ("--noise".into(), or(&args.noise, "estimated")),
+            ("--strict".into(), set(args.strict)),
+        ]
+    }
+}
+
+/// Pictures for the screen are PNG or JPEG.
+pub(super) fn check_picture_name(option: &str, path: &Path) -> Result<(), Usage> {
+    match output::ending(path).as_str() {
+        "png" | "jpg" | "jpeg" => Ok(()),
+        _ => Err(Usage(format!("{option}: {} ends with neither .png nor .jpg; name the format by the ending", path.display()))),
+    }
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
     let (width, height) = bracket.size();
     let frame = &bracket.frames()[reference];
+    let what = if args.photo.absolute { "cd/m2; white is that" } else { "1.0 is the white" };
     format!(
-        "wrote {} ({width} x {height}; 1.0 is the white of frame {}, {}, at {} s)",
+        "wrote {} ({width} x {height}; {what} of frame {}, {}, at {} s)",
         args.output.display(),
         reference + 1,
         frame.name,
@@ -202,17 +388,32 @@ fn noise_level(text: &str) -> Result<NoiseModel, Usage> {
     }
 }
 
-/// The three outputs, of which each can be written.
-fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<(Output, Option<Output>, Option<Output>)> {
+/// The outputs, of which each can be written.
+struct Targets {
+    linear: Output,
+    preview: Option<Output>,
+    report: Option<Output>,
+    page: Option<Output>,
+}
+
+fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
     inputs.extend(response_file.map(|p| ("response file", p)));
     inputs.extend(args.tsf.as_deref().map(|p| ("TSF file", p)));
+    inputs.extend(args.photo.config.as_deref().map(|p| ("configuration", p)));
     let mut targets = vec![("--output", args.output.as_path())];
     targets.extend(args.preview.as_deref().map(|p| ("--preview", p)));
     targets.extend(args.report.as_deref().map(|p| ("--report", p)));
+    targets.extend(args.photo.report_html.as_deref().map(|p| ("--report-html", p)));
     output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
     let check = |p: &PathBuf| Output::check(p, args.overwrite);
-    Ok((check(&args.output)?, args.preview.as_ref().map(check).transpose()?, args.report.as_ref().map(check).transpose()?))
+    let checked = |p: &Option<PathBuf>| p.as_ref().map(check).transpose();
+    Ok(Targets {
+        linear: check(&args.output)?,
+        preview: checked(&args.preview)?,
+        report: checked(&args.report)?,
+        page: checked(&args.photo.report_html)?,
+    })
 }
 
 pub(super) fn read_response(path: &Path) -> Result<Response, Error> {

@@ -1,22 +1,31 @@
 //! The command line: arguments, one file per command, progress. The only place that prints.
 //!
-//! Exit code 0: done; 1: failed; 2: the command line itself is wrong; 3: done, but not as asked (`--strict`). An error is one line on standard error.
+//! Exit code 0: done; 1: failed; 2: the command line itself is wrong; 3: done but degraded, under `--strict`; 130: interrupted. An error
+//! is one line on standard error.
 
 mod adapters;
 mod args;
 mod baseline;
+mod batch;
 mod calibrate;
 mod compare;
 pub mod demo;
 mod experiment;
 mod frames;
+mod generate;
+mod grouping;
+mod interrupt;
 mod merge;
+mod options;
+mod page;
 mod progress;
 mod response;
 mod synth;
+mod tonemap;
 
+use crate::error::Error;
 use crate::pipeline::Event;
-use clap::Parser;
+use progress::Voice;
 use std::process::ExitCode;
 
 /// The command line itself is wrong: exit code 2.
@@ -29,37 +38,53 @@ struct Usage(String);
 enum Done {
     /// All is as asked.
     AsAsked,
-    /// Something was written, but frames had to be left out, and the user wants to know: exit code 3.
+    /// Something was written, but a stage warned: frames were left out, or nothing could be deblurred.
     Degraded,
 }
+/// Exit code of a result that is less than it should be, under `--strict`.
+const DEGRADED: u8 = 3;
 
 /// Runs the program on the process's arguments.
 pub fn run() -> ExitCode {
-    let line = match args::CommandLine::try_parse() {
-        Ok(line) => line,
-        Err(e) if !e.use_stderr() => {
+    let line = match options::parse(std::env::args_os().collect()) {
+        Ok(options::Parsed::Line(line)) => line,
+        Ok(options::Parsed::Print(text)) => {
+            print!("{text}");
+            return ExitCode::SUCCESS;
+        }
+        Err(options::Refused::Clap(e)) if !e.use_stderr() => {
             // Help and version; nothing is left to do if even they cannot be printed.
             let _ = e.print();
             return ExitCode::SUCCESS;
         }
-        Err(e) => return report(&usage_of(&e).into()),
+        Err(options::Refused::Clap(e)) => return report(&usage_of(&e).into()),
+        Err(options::Refused::Other(e)) => return report(&e),
     };
-    let done = match line.command {
-        args::Command::Merge(a) => merge::run(&a),
-        args::Command::Calibrate(a) => calibrate::run(&a).map(|()| Done::AsAsked),
-        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events)).map(|text| {
-            println!("{text}");
-            Done::AsAsked
-        }),
-        args::Command::Synth(a) => synth::run(&a).map(|()| Done::AsAsked),
-        args::Command::Compare(a) => compare::run(&a).map(|()| Done::AsAsked),
-        args::Command::Baseline(a) => baseline::run(&a).map(|()| Done::AsAsked),
-        args::Command::Experiment(a) => experiment::run(&a).map(|()| Done::AsAsked),
-        args::Command::Adapters => adapters::run().map(|()| Done::AsAsked),
+    progress::set_voice(match (line.line.session.quiet, line.line.session.json) {
+        (true, _) => Voice::Quiet,
+        (_, true) => Voice::Json,
+        _ => Voice::Human,
+    });
+    interrupt::listen();
+    let as_asked = |()| Done::AsAsked;
+    let done = match &line.line.command {
+        args::Command::Merge(a) => merge::run(a),
+        args::Command::Calibrate(a) => calibrate::run(a).map(as_asked),
+        args::Command::Demo(a) => with_progress(|events| demo::run(&a.output_dir, events))
+            .map(|text| progress::done(&text, serde_json::json!({ "output": a.output_dir })))
+            .map(as_asked),
+        args::Command::Synth(a) => synth::run(a).map(as_asked),
+        args::Command::Compare(a) => compare::run(a).map(as_asked),
+        args::Command::Baseline(a) => baseline::run(a).map(as_asked),
+        args::Command::Experiment(a) => experiment::run(a).map(as_asked),
+        args::Command::Adapters => adapters::run().map(as_asked),
+        args::Command::Tonemap(a) => tonemap::run(a).map(as_asked),
+        args::Command::Batch(a) => batch::run(a, &line.merge_options),
+        args::Command::Generate(a) => generate::run(a).map(as_asked),
     };
     match done {
         Ok(Done::AsAsked) => ExitCode::SUCCESS,
-        Ok(Done::Degraded) => ExitCode::from(3),
+        Ok(Done::Degraded) => ExitCode::from(DEGRADED),
         Err(e) => report(&e),
     }
 }
@@ -72,13 +97,22 @@ fn with_progress<T>(job: impl FnOnce(&mut dyn FnMut(Event) -> bool) -> anyhow::R
             Event::Progress { stage, fraction } => progress.at(&stage, fraction),
             Event::Warning(text) => progress.warn(&text),
         }
-        true
+        !interrupt::asked()
     })
 }
 
 fn report(e: &anyhow::Error) -> ExitCode {
-    eprintln!("error: {}", one_line(&format!("{e:#}")));
-    ExitCode::from(if e.is::<Usage>() { 2 } else { 1 })
+    let interrupted = interrupt::asked() && matches!(e.downcast_ref::<Error>(), Some(Error::Cancelled));
+    let text = if interrupted { "interrupted; nothing was written".to_string() } else { one_line(&format!("{e:#}")) };
+    if progress::voice() == Voice::Json {
+        progress::event(&serde_json::json!({ "event": "error", "text": text }));
+    }
+    eprintln!("error: {text}");
+    ExitCode::from(match () {
+        () if interrupted => interrupt::INTERRUPTED,
+        () if e.is::<Usage>() => 2,
+        () => 1,
+    })
 }
 
 fn warn(text: &str) {

@@ -1,4 +1,4 @@
-//! Frames: 8- and 16-bit PNG, JPEG and TIFF files into intensity Z.
+//! Frames: 8- and 16-bit PNG, JPEG and TIFF files into intensity Z; TIFF files of floating-point numbers, which are linear.
 
 use crate::error::{Error, Result};
 use crate::image::{Plane, Rgb};
@@ -14,9 +14,16 @@ const MAX_DECODED_BYTES: u64 = 4 << 30;
 pub struct Picture {
     /// Intensity Z, 0..=1 with 1 the file's largest code. Grey files have three equal channels; alpha is dropped.
     pub intensity: Rgb,
-    /// Number of intensity steps: 255 for 8 bits, 65535 for 16 bits.
+    /// Number of intensity steps: 255 for 8 bits, 65535 for 16 bits, [`FLOAT_LEVELS`] for floating point.
     pub levels: u32,
+    /// Whether the file holds floating-point numbers: those are linear, and may be above 1.
+    pub float: bool,
+    /// The ICC profile that the file embeds.
+    pub icc: Option<Vec<u8>>,
 }
+
+/// Intensity steps that floating-point frames count as: far below any noise, yet a table of them is quickly made.
+pub const FLOAT_LEVELS: u32 = 1 << 20;
 
 /// Reads a frame, upright: the orientation that the camera noted is applied.
 ///
@@ -24,12 +31,16 @@ pub struct Picture {
 /// [`Error::Read`] when the file cannot be opened; [`Error::Format`] when it is empty, truncated, damaged, no picture,
 /// or a picture of another kind (floating point, other file formats), with the remedy.
 pub fn read(path: &Path) -> Result<Picture> {
-    let bytes = super::read_bytes(path)?;
+    decode(path, &super::read_bytes(path)?)
+}
+
+/// [`read`] of bytes that are read already.
+pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
     let format = |reason: String| Error::Format { path: path.into(), reason };
     if bytes.is_empty() {
         return Err(format("is empty; copy it again from the camera".into()));
     }
-    let reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format().expect("memory is readable");
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().expect("memory is readable");
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::Tiff) => {}
         Some(other) => {
@@ -38,37 +49,40 @@ pub fn read(path: &Path) -> Result<Picture> {
         None => return Err(format("is not a picture that can be read; frames are 8- or 16-bit PNG, JPEG or TIFF files".into())),
     }
     // The JPEG decoder fills what is missing with grey and reports success.
-    if reader.format() == Some(ImageFormat::Jpeg) && !jpeg_is_complete(&bytes) {
+    if reader.format() == Some(ImageFormat::Jpeg) && !jpeg_is_complete(bytes) {
         return Err(format("is truncated; copy it again from the camera".into()));
     }
-    let decode = || -> std::result::Result<DynamicImage, ImageError> {
+    let decode = || -> std::result::Result<(DynamicImage, Option<Vec<u8>>), ImageError> {
         let mut decoder = reader.into_decoder()?;
         let mut limits = Limits::default();
         limits.max_alloc = Some(MAX_DECODED_BYTES);
         decoder.set_limits(limits)?;
         let orientation = decoder.orientation()?;
+        let icc = decoder.icc_profile()?;
         let mut picture = DynamicImage::from_decoder(decoder)?;
         picture.apply_orientation(orientation);
-        Ok(picture)
+        Ok((picture, icc))
     };
-    let picture = decode().map_err(|e| format(reason(&e)))?;
+    let (picture, icc) = decode().map_err(|e| format(reason(&e)))?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
-    let bits16 = match &picture {
-        DynamicImage::ImageLuma8(_) | DynamicImage::ImageLumaA8(_) | DynamicImage::ImageRgb8(_) | DynamicImage::ImageRgba8(_) => false,
-        DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) | DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => true,
-        _ => return Err(format("holds floating-point pixels; save the frame with 8 or 16 bits per channel".into())),
-    };
-    if bits16 {
-        let raw = picture.into_rgb16().into_raw();
-        Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535 })
-    } else {
-        let raw = picture.into_rgb8().into_raw();
-        Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255 })
+    match &picture {
+        DynamicImage::ImageLuma8(_) | DynamicImage::ImageLumaA8(_) | DynamicImage::ImageRgb8(_) | DynamicImage::ImageRgba8(_) => {
+            let raw = picture.into_rgb8().into_raw();
+            Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255, float: false, icc })
+        }
+        DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) | DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => {
+            let raw = picture.into_rgb16().into_raw();
+            Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535, float: false, icc })
+        }
+        _ => {
+            let raw = picture.into_rgb32f().into_raw();
+            Ok(Picture { intensity: planes(&raw, width, height, 1.0), levels: FLOAT_LEVELS, float: true, icc })
+        }
     }
 }
 
 /// Interleaved codes to planes of code / `largest`.
-fn planes<T: Copy + Into<f32>>(raw: &[T], width: usize, height: usize, largest: f32) -> Rgb {
+pub(super) fn planes<T: Copy + Into<f32>>(raw: &[T], width: usize, height: usize, largest: f32) -> Rgb {
     Rgb(std::array::from_fn(|c| Plane { width, height, data: raw.iter().skip(c).step_by(3).map(|&v| v.into() / largest).collect() }))
 }
 

@@ -1,17 +1,24 @@
 //! Bytes to frames and back: files stop here, and so do the error types of the crates that read them.
 //!
-//! * [`ldr`] reads the frames (PNG, JPEG, TIFF; 8 or 16 bits), [`metadata`] their exposure times;
+//! * [`input`] reads a frame of any kind: [`ldr`] (PNG, JPEG, TIFF), `raw` (camera raw files, feature `raw`), [`exr`], Radiance HDR;
+//!   [`metadata`] what the camera noted, [`icc`] what an embedded profile says of its colours;
 //! * [`exif`] writes frames with their exposure time;
-//! * [`exr`] writes and reads linear OpenEXR;
+//! * [`exr`] and [`picture`] write results, linear or for display;
 //! * [`output`] writes every result beside its target and renames it, so that nothing is ever half-written.
 
 pub mod exif;
 pub mod exr;
+pub mod icc;
+pub mod input;
 pub mod ldr;
 pub mod metadata;
 pub mod output;
+pub mod picture;
+#[cfg(feature = "raw")]
+pub mod raw;
 
 use crate::error::{Error, Result};
+use crate::image::{Plane, Rgb};
 use std::path::Path;
 
 /// The text of a (JSON) file.
@@ -35,4 +42,19 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>> {
 pub(crate) fn plain(e: &std::io::Error) -> String {
     let text = e.to_string();
     text.split(" (os error").next().unwrap_or(&text).to_lowercase()
+}
+
+/// The picture turned and mirrored so that it is upright; `orientation` as EXIF counts it, 1 to 8.
+pub(crate) fn upright(image: &Rgb, orientation: u32) -> Rgb {
+    let (w, h) = image.size();
+    image.map_planes(|p| match orientation {
+        2 => Plane::from_fn(w, h, |x, y| p.at(w - 1 - x, y)),
+        3 => Plane::from_fn(w, h, |x, y| p.at(w - 1 - x, h - 1 - y)),
+        4 => Plane::from_fn(w, h, |x, y| p.at(x, h - 1 - y)),
+        5 => Plane::from_fn(h, w, |x, y| p.at(y, x)),
+        6 => Plane::from_fn(h, w, |x, y| p.at(y, h - 1 - x)),
+        7 => Plane::from_fn(h, w, |x, y| p.at(w - 1 - y, h - 1 - x)),
+        8 => Plane::from_fn(h, w, |x, y| p.at(w - 1 - y, x)),
+        _ => p.clone(),
+    })
 }

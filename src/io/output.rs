@@ -1,13 +1,43 @@
 //! Results: each is written beside its target and renamed, so that a target is either whole or untouched.
 
-use super::exr::Radiometry;
+use super::exr::{self, Radiometry};
+use super::metadata::Metadata;
 use super::plain;
 use crate::error::{Error, Result};
 use crate::image::Rgb;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use tempfile::NamedTempFile;
+
+/// Files beside their targets that are not renamed yet, for [`abandon`]. Held while a set of results is renamed.
+static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+
+/// Removes every file that is not renamed to its target yet, and lets none be renamed from now on: for a process that is about to end
+/// without its destructors. A set of results that is being renamed is renamed first.
+pub fn abandon() {
+    let Ok(files) = UNFINISHED.lock() else { return };
+    for file in files.iter() {
+        let _ = std::fs::remove_file(file);
+    }
+    // Whoever would rename now waits for ever, that is until the process ends.
+    std::mem::forget(files);
+}
+
+/// Renames all results to their targets, with nothing in between that could be interrupted by [`abandon`].
+///
+/// # Errors
+/// [`Error::Write`], see [`Staged::commit`]; those before it are renamed then.
+pub fn commit_all(staged: Vec<Staged>) -> Result<()> {
+    let mut unfinished = UNFINISHED.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    for file in staged {
+        let at = file.file.path().to_path_buf();
+        file.rename()?;
+        unfinished.retain(|p| *p != at);
+    }
+    Ok(())
+}
 
 /// A target that can be written, as far as can be told before the work begins.
 #[derive(Clone, Debug)]
@@ -56,6 +86,7 @@ impl Output {
     /// [`Error::Write`] with the reason that `write` gives, or the system's.
     pub fn stage(&self, write: impl FnOnce(&mut BufWriter<&File>) -> std::result::Result<(), String>) -> Result<Staged> {
         let file = self.temporary()?;
+        UNFINISHED.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push(file.path().to_path_buf());
         let mut buffer = BufWriter::new(file.as_file());
         write(&mut buffer).map_err(|e| self.refuse(&e))?;
         buffer.flush().map_err(|e| self.refuse(&plain(&e)))?;
@@ -69,7 +100,7 @@ impl Output {
     /// # Errors
     /// [`Error::Write`], also for pixels that are NaN, infinite or negative.
     pub fn stage_exr(&self, image: &Rgb, radiometry: &Radiometry) -> Result<Staged> {
-        self.stage(|to| super::exr::write(to, image, radiometry))
+        self.stage(|to| exr::write(to, image, radiometry))
     }
 
     /// Stages a value as JSON text, indented, with a line end.
@@ -83,15 +114,52 @@ impl Output {
         })
     }
 
-    /// Stages an 8-bit PNG.
+    /// Stages an 8-bit sRGB PNG.
     ///
     /// # Errors
     /// [`Error::Write`].
     pub fn stage_png(&self, picture: &::image::RgbImage) -> Result<Staged> {
-        self.stage(|to| {
-            let encoder = ::image::codecs::png::PngEncoder::new(to);
-            picture.write_with_encoder(encoder).map_err(|e| e.to_string())
+        self.stage(|to| super::picture::write_png(to, picture, None))
+    }
+
+    /// Stages a picture as PNG or, where the target's name ends so, as JPEG of `quality`; with the sRGB profile and what the camera noted.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_picture(&self, picture: &::image::RgbImage, quality: u8, noted: &Metadata) -> Result<Staged> {
+        self.stage(|to| match ending(&self.path).as_str() {
+            "jpg" | "jpeg" => super::picture::write_jpeg(to, picture, quality, Some(noted)),
+            _ => super::picture::write_png(to, picture, Some(noted)),
         })
+    }
+
+    /// Stages text.
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_text(&self, text: &str) -> Result<Staged> {
+        self.stage(|to| to.write_all(text.as_bytes()).map_err(|e| plain(&e)))
+    }
+
+    /// Stages a linear image in the format that the target's name ends with: `.hdr` Radiance (Rec. 709 only), `.tif` or `.tiff` TIFF
+    /// (linear; floating point, or 16-bit integers of what is below 1 for [`exr::Style::half`]), else OpenEXR. Returns the share of the
+    /// values that the format clips as well.
+    ///
+    /// # Errors
+    /// [`Error::Write`], also for pixels that are NaN, infinite or negative.
+    pub fn stage_linear(&self, image: &Rgb, radiometry: &Radiometry, style: &exr::Style) -> Result<(Staged, f64)> {
+        use super::picture::{Depth, write_radiance, write_tiff};
+        let mut clipped = 0.0;
+        let staged = self.stage(|to| match ending(&self.path).as_str() {
+            "hdr" => write_radiance(to, image),
+            "tif" | "tiff" => {
+                let depth = if style.half { Depth::Sixteen } else { Depth::Float };
+                clipped = write_tiff(to, image, depth, style.primaries, &style.metadata)?;
+                Ok(())
+            }
+            _ => exr::write_styled(to, image, radiometry, style),
+        })?;
+        Ok((staged, clipped))
     }
 
     /// Stages a JPEG of `quality` 1..=100, for pictures that noise makes large as PNG.
@@ -99,10 +167,7 @@ impl Output {
     /// # Errors
     /// [`Error::Write`].
     pub fn stage_jpeg(&self, picture: &::image::RgbImage, quality: u8) -> Result<Staged> {
-        self.stage(|to| {
-            let encoder = ::image::codecs::jpeg::JpegEncoder::new_with_quality(to, quality);
-            picture.write_with_encoder(encoder).map_err(|e| e.to_string())
-        })
+        self.stage(|to| super::picture::write_jpeg(to, picture, quality, None))
     }
 
     fn folder(&self) -> &Path {
@@ -140,6 +205,11 @@ impl Output {
     }
 }
 
+/// What the name ends with after its last point, in lower case.
+pub fn ending(path: &Path) -> String {
+    path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default()
+}
+
 /// The system's words without the name of the temporary file behind them.
 fn before_path(said: &str) -> &str {
     said.split(" at path").next().unwrap_or(said)
@@ -151,6 +221,10 @@ impl Staged {
     /// # Errors
     /// [`Error::Write`] when the target has come into being meanwhile or the system refuses.
     pub fn commit(self) -> Result<()> {
+        commit_all(vec![self])
+    }
+
+    fn rename(self) -> Result<()> {
         self.output.check_target()?;
         self.file.persist(&self.output.path).map_err(|e| self.output.refuse(&plain(&e.error)))?;
         Ok(())

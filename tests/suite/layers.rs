@@ -50,6 +50,10 @@ const TABLE: &[(&str, &[&str])] = &[
     ),
     // Brackets with known truth: never an estimator.
     ("synth", &["error", "image", "pose", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    // Colours.
+    ("colour", &["image"]),
+    // What a result rests on.
+    ("layers", &["image", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
@@ -74,7 +78,7 @@ const TABLE: &[(&str, &[&str])] = &[
         ],
     ),
     // The edges of the program.
-    ("io", &["error", "image", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    ("io", &["error", "image", "colour", "mask::CLIPPED", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
     (
         "cli",
         &[
@@ -85,6 +89,9 @@ const TABLE: &[(&str, &[&str])] = &[
             "response",
             "baseline",
             "experiments",
+            "colour",
+            "layers",
+            "mask",
             "io",
             "pipeline",
             "metrics",

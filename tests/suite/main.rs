@@ -10,6 +10,8 @@ mod support;
 mod adjoint;
 /// The plain merge on frames whose irradiance is known.
 mod baseline;
+/// Many photographs: grouping, shards, resuming; configuration, voices, interruption.
+mod batch;
 /// The program as a user runs it: outputs, messages, exit codes.
 mod cli;
 /// The demo's bracket and its before/after picture.
@@ -22,6 +24,10 @@ mod kernels;
 mod layers;
 /// Quality measures against stored values of an independent implementation.
 mod metrics;
+/// The report page in a real browser.
+mod page;
+/// Photographers' files: raw, notes, profiles, primaries; what results say of themselves.
+mod photo;
 /// Registration: motions planted in drawn scenes, what is refused.
 mod register;
 /// Response: calibration against truth and against OpenCV, response files.

@@ -2,6 +2,7 @@
 
 pub mod files;
 pub mod gpu;
+pub mod photos;
 
 use unshaken::image::Plane;
 

@@ -1,0 +1,273 @@
+//! Camera raw files (feature `raw`, through rawler) into linear frames in the camera's own colours.
+//!
+//! The frame stays in camera RGB, each channel 1 where it saturates: what the solver sees is what the sensor recorded, shot noise and
+//! saturation included. White balance and the camera's matrix belong to the result and come along as one matrix.
+
+use super::metadata::{self, Metadata};
+use crate::colour::{self, Matrix, Primaries};
+use crate::image::{Plane, Rgb};
+use crate::mask::CLIPPED;
+use rawler::decoders::{Decoder, Orientation, RawDecodeParams, WellKnownIFD};
+use rawler::imgop::develop::{Intermediate, ProcessingStep, RawDevelop};
+use rawler::imgop::xyz::Illuminant;
+use rawler::rawimage::RawPhotometricInterpretation as Photometric;
+use rawler::rawsource::RawSource;
+use rawler::tags::TiffCommonTag;
+use rawler::{RawImage, RawImageData};
+use std::cell::Cell;
+use std::panic::{self, AssertUnwindSafe};
+use std::sync::Once;
+
+/// A developed raw file.
+pub struct Raw {
+    /// Camera RGB, linear, black 0, saturation 1; saturated sites and what was interpolated from them are 1. Upright.
+    pub intensity: Rgb,
+    /// Camera RGB to XYZ relative to D50, as-shot white balance included; the least amplified channel's saturation is white.
+    pub to_xyz: Matrix,
+    /// What the file notes.
+    pub metadata: Metadata,
+}
+
+/// Whether rawler knows files whose names end so (without point). TIFF and JPEG files are not raw, whatever they hold besides.
+pub fn is_raw_name(ending: &str) -> bool {
+    let known = rawler::decoders::supported_extensions().iter().any(|e| e.eq_ignore_ascii_case(ending));
+    known && !["tif", "tiff", "jpg", "jpeg", "png"].contains(&ending.to_ascii_lowercase().as_str())
+}
+
+/// Develops the bytes of a raw file.
+///
+/// # Errors
+/// Why it cannot be, with the remedy, in words that follow the file's name.
+pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
+    check_directories(&bytes)?;
+    let noted = metadata::read_bytes(&bytes);
+    quietly(move || {
+        let source = RawSource::new_from_shared_vec(bytes.into());
+        let decoder = rawler::get_decoder(&source).map_err(|e| reason(&e))?;
+        let params = RawDecodeParams::default();
+        check_size(decoder.as_ref(), source.buf().len())?;
+        let raw = decoder.raw_image(&source, &params, false).map_err(|e| reason(&e))?;
+        // Files that are no TIFF within (CR3, RAF) tell rawler alone.
+        let metadata = match decoder.raw_metadata(&source, &params) {
+            Ok(m) => complete(noted, &m),
+            Err(_) => noted,
+        };
+        develop(raw, metadata)
+    })
+    .unwrap_or_else(|| Err("is damaged, or of a kind that cannot be developed; copy it again from the camera, or convert it to DNG".into()))
+}
+
+/// Pixels per byte that no compression of raw files reaches.
+const LEAST_DENSE: usize = 64;
+
+/// Refuses TIFF directories whose entries claim more values than the file has bytes, in files that are built like TIFF: rawler asks for memory
+/// for as many.
+fn check_directories(bytes: &[u8]) -> Result<(), String> {
+    let little = match bytes.get(..2) {
+        Some(b"II") => true,
+        Some(b"MM") => false,
+        _ => return Ok(()),
+    };
+    let number = |at: usize, length: usize| {
+        let part = bytes.get(at..at.checked_add(length)?)?;
+        let join = |n: usize, b: &u8| n << 8 | usize::from(*b);
+        Some(if little { part.iter().rev().fold(0, join) } else { part.iter().fold(0, join) })
+    };
+    let damaged = || "is truncated or damaged (a directory that cannot be); copy it again from the camera".to_string();
+    let mut waiting = vec![number(4, 4).ok_or_else(damaged)?];
+    let mut seen = Vec::new();
+    while let Some(at) = waiting.pop() {
+        if at == 0 || seen.contains(&at) {
+            continue;
+        }
+        seen.push(at);
+        let Some(entries) = number(at, 2) else { continue };
+        for entry in (0..entries).map(|i| at + 2 + 12 * i) {
+            let (Some(tag), Some(kind), Some(count), Some(value)) =
+                (number(entry, 2), number(entry + 2, 2), number(entry + 4, 4), number(entry + 8, 4))
+            else {
+                return Err(damaged());
+            };
+            let size = match kind {
+                1 | 2 | 6 | 7 => 1,
+                3 | 8 => 2,
+                4 | 9 | 11 | 13 => 4,
+                _ => 8,
+            };
+            if count * size > bytes.len() {
+                return Err(damaged());
+            }
+            // SubIFDs, EXIF and GPS.
+            if matches!(tag, 330 | 34665 | 34853) {
+                match count {
+                    1 => waiting.push(value),
+                    n => waiting.extend((0..n).filter_map(|i| number(value + 4 * i, 4))),
+                }
+            }
+        }
+        waiting.extend(number(at + 2 + 12 * entries, 4));
+    }
+    Ok(())
+}
+
+/// Refuses sizes that cannot be before memory is asked for them: that would end the program.
+fn check_size(decoder: &dyn Decoder, bytes: usize) -> Result<(), String> {
+    let Ok(Some(directory)) = decoder.ifd(WellKnownIFD::Raw) else { return Ok(()) };
+    let number = |tag: TiffCommonTag| directory.get_entry(tag).map_or(1, |e| e.force_usize(0));
+    let samples = [TiffCommonTag::ImageWidth, TiffCommonTag::ImageLength, TiffCommonTag::SamplesPerPixel].map(number);
+    let product = samples.into_iter().try_fold(1usize, |a, n| a.checked_mul(n));
+    if product.is_none_or(|n| n > LEAST_DENSE * bytes) {
+        return Err(format!("claims {} x {} pixels, more than it can hold; copy it again from the camera", samples[0], samples[1]));
+    }
+    Ok(())
+}
+
+fn reason(e: &rawler::RawlerError) -> String {
+    match e {
+        rawler::RawlerError::Unsupported { what, model, make, .. } => {
+            format!("is of a camera that is not supported ({} {}: {}); convert it to DNG", make.trim(), model.trim(), what.trim())
+        }
+        rawler::RawlerError::DecoderFailed(text) => {
+            let text = text.split_whitespace().take(30).collect::<Vec<_>>().join(" ");
+            format!("is truncated or damaged ({text}); copy it again from the camera")
+        }
+    }
+}
+
+thread_local!(static QUIET: Cell<bool> = const { Cell::new(false) });
+
+/// Runs `f`; `None` when it panics, which decoders of a hundred formats do on damaged files, and without the panic's message.
+fn quietly<T>(f: impl FnOnce() -> T) -> Option<T> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let before = panic::take_hook();
+        panic::set_hook(Box::new(move |info| {
+            if !QUIET.get() {
+                before(info);
+            }
+        }));
+    });
+    QUIET.set(true);
+    let out = panic::catch_unwind(AssertUnwindSafe(f)).ok();
+    QUIET.set(false);
+    out
+}
+
+fn complete(mut noted: Metadata, m: &rawler::decoders::RawMetadata) -> Metadata {
+    let ratio = |r: &rawler::formats::tiff::Rational| Some(f64::from(r.n) / f64::from(r.d)).filter(|v| v.is_finite());
+    let positive = |r: &rawler::formats::tiff::Rational| ratio(r).filter(|v| *v > 0.0);
+    let e = &m.exif;
+    noted.exposure_time = noted.exposure_time.or_else(|| e.exposure_time.as_ref().and_then(ratio));
+    noted.f_number = noted.f_number.or_else(|| e.fnumber.as_ref().and_then(positive));
+    noted.iso = noted.iso.or_else(|| e.iso_speed_ratings.map(f64::from).filter(|v| *v > 0.0 && *v < 65535.0));
+    noted.iso = noted.iso.or_else(|| e.iso_speed.map(f64::from).filter(|v| *v > 0.0));
+    noted.taken = noted.taken.or_else(|| e.date_time_original.clone());
+    noted.artist = noted.artist.or_else(|| e.artist.clone());
+    noted.copyright = noted.copyright.or_else(|| e.copyright.clone());
+    noted.lens = noted.lens.or_else(|| e.lens_model.clone());
+    let named = |s: &str| (!s.trim().is_empty()).then(|| s.trim().to_string());
+    noted.make = noted.make.or_else(|| named(&m.make));
+    noted.model = noted.model.or_else(|| named(&m.model));
+    noted
+}
+
+fn develop(mut raw: RawImage, metadata: Metadata) -> Result<Raw, String> {
+    match &raw.photometric {
+        Photometric::Cfa(c) if c.cfa.is_rgb() => {}
+        Photometric::LinearRaw if raw.cpp == 3 => {}
+        Photometric::Cfa(_) => {
+            return Err("has a colour filter other than red, green and blue; convert it to a linear DNG or 16-bit TIFF".into());
+        }
+        _ => return Err("is monochrome or of an odd kind; convert it to 16-bit TIFF".into()),
+    }
+    let white = raw.whitelevel.as_bayer_array();
+    let black = raw.blacklevel.as_bayer_array();
+    if (0..4).any(|i| white[i] <= black[i]) {
+        return Err(format!("notes a white level ({}) that is not above its black level ({}); the file is damaged", white[0], black[0]));
+    }
+    let to_xyz = camera_matrix(&raw)?;
+    raw.apply_scaling().map_err(|e| reason(&e))?;
+    // Sensor noise lies on both sides of black.
+    let saturated = saturated_sites(&raw);
+    let crop = raw.crop_area.or(raw.active_area);
+    let (left, top) = crop.map_or((0, 0), |c| (c.p.x, c.p.y));
+    let orientation = raw.orientation;
+    let steps = [ProcessingStep::Demosaic, ProcessingStep::CropActiveArea, ProcessingStep::CropDefault];
+    let developed = RawDevelop::new_with(&steps).develop_intermediate(&raw).map_err(|e| reason(&e))?;
+    let Intermediate::ThreeColor(pixels) = developed else { return Err("has not three colours; convert it to 16-bit TIFF".into()) };
+    let (width, height) = (pixels.width, pixels.height);
+    let data = pixels.into_inner();
+    let planes: [Plane; 3] = std::array::from_fn(|c| {
+        let mut plane =
+            Plane { width, height, data: data.iter().map(|p| if p[c].is_finite() { p[c].clamp(0.0, 1.0) } else { 0.0 }).collect() };
+        spread(&mut plane, &saturated, c as u8, (left, top), raw.width, raw.height);
+        plane
+    });
+    let intensity = match orientation {
+        Orientation::Unknown => Rgb(planes),
+        o => super::upright(&Rgb(planes), u32::from(o.to_u16())),
+    };
+    Ok(Raw { intensity, to_xyz, metadata })
+}
+
+/// For each site of the sensor, a bit for each channel that it records and that is saturated there.
+fn saturated_sites(raw: &RawImage) -> Vec<u8> {
+    let RawImageData::Float(values) = &raw.data else { return vec![0; raw.width * raw.height] };
+    match &raw.photometric {
+        Photometric::Cfa(config) => {
+            let site = |i: usize| config.cfa.color_at(i / raw.width, i % raw.width).min(2);
+            values.iter().enumerate().map(|(i, v)| if *v >= CLIPPED { 1 << site(i) } else { 0 }).collect()
+        }
+        _ => values.chunks_exact(3).map(|p| (0..3).fold(0, |bits, c| bits | (u8::from(p[c] >= CLIPPED) << c))).collect(),
+    }
+}
+
+/// Sets pixels within one site of a saturated site of channel `c` to 1: what was interpolated from clipped values is not a measurement.
+fn spread(plane: &mut Plane, saturated: &[u8], c: u8, (left, top): (usize, usize), width: usize, height: usize) {
+    for y in 0..plane.height {
+        for x in 0..plane.width {
+            let (i, j) = (x + left, y + top);
+            let hit = (j.saturating_sub(1)..(j + 2).min(height))
+                .any(|b| (i.saturating_sub(1)..(i + 2).min(width)).any(|a| saturated[b * width + a] >> c & 1 == 1));
+            if hit {
+                plane.data[y * plane.width + x] = 1.0;
+            }
+        }
+    }
+}
+
+/// As-shot white balance and the camera's matrix: camera RGB to XYZ relative to D50. The matrix is scaled so that what the white balance
+/// calls neutral becomes D50 exactly, as dcraw does.
+fn camera_matrix(raw: &RawImage) -> Result<Matrix, String> {
+    const LIGHTS: [(Illuminant, colour::Chromaticity); 6] = [
+        (Illuminant::D65, colour::D65),
+        (Illuminant::D55, [0.3324, 0.3474]),
+        (Illuminant::D50, colour::D50),
+        (Illuminant::D75, [0.2990, 0.3149]),
+        (Illuminant::C, [0.3101, 0.3162]),
+        (Illuminant::A, [0.4476, 0.4074]),
+    ];
+    let found = LIGHTS.iter().find_map(|(light, white)| Some((raw.color_matrix.get(light)?, *white)));
+    let any = || raw.color_matrix.values().next().map(|m| (m, colour::D65));
+    let Some((flat, white)) = found.or_else(any).filter(|(m, _)| m.len() >= 9) else {
+        return Err("holds no colour matrix, and its camera is not known; convert it to DNG or 16-bit TIFF".into());
+    };
+    let xyz_to_camera: Matrix = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(flat[3 * i + j])));
+    // From D50, in which everything meets, to the light that the matrix was measured under.
+    let adapted = colour::adaptation(colour::D50, white).expect("the lights are real ones");
+    let rgb = Primaries::Rec709.to_xyz();
+    let mut camera = colour::product(&xyz_to_camera, &colour::product(&adapted, &rgb));
+    for row in &mut camera {
+        let sum: f64 = row.iter().sum();
+        *row = row.map(|v| v / sum);
+    }
+    let refuse = || "holds a colour matrix that cannot be inverted; convert it to 16-bit TIFF".to_string();
+    let camera = colour::inverse(&camera).ok_or_else(refuse)?;
+    let mut balance: [f64; 3] = std::array::from_fn(|c| f64::from(raw.wb_coeffs[c]));
+    if balance.iter().any(|v| !(v.is_finite() && *v > 0.0)) {
+        return Err("notes no white balance; convert it to DNG or 16-bit TIFF with one".into());
+    }
+    let least = balance.into_iter().fold(f64::INFINITY, f64::min);
+    balance = balance.map(|v| v / least);
+    Ok(colour::product(&rgb, &colour::product(&camera, &colour::diagonal(balance))))
+}

@@ -1,0 +1,81 @@
+//! What a result rests on, pixel by pixel: for the further channels of the OpenEXR file and for the report.
+
+use crate::exposure::Bracket;
+use crate::image::Plane;
+use crate::mask::CLIPPED;
+use crate::noise::NoiseModel;
+use crate::pipeline::Outcome;
+use crate::response::Response;
+use rayon::prelude::*;
+
+/// What a result rests on.
+#[derive(Clone, Debug)]
+pub struct Grounds {
+    /// Of each used frame (its index), 1 over the variance of what it says of the irradiance, in units of the result (1 = the reference
+    /// frame's white), green channel; 0 where the frame is clipped.
+    pub information: Vec<(usize, Plane)>,
+    /// Part of the used frames that are clipped, 0..=1.
+    pub saturation: Plane,
+}
+
+/// Information and saturation of the frames that `outcome` used, each on its own pixels.
+pub fn grounds(bracket: &Bracket, response: &Response, outcome: &Outcome) -> Grounds {
+    let frames = bracket.frames();
+    let (width, height) = bracket.size();
+    let noise: NoiseModel =
+        serde_json::from_value(outcome.report["noise"].clone()).unwrap_or_else(|_| NoiseModel::from_electrons(10_000.0, 5.0));
+    let used: Vec<usize> = (0..frames.len()).filter(|&i| outcome.misfit[i].is_some()).collect();
+    let scale = frames[outcome.reference].exposure_time;
+    let result = &outcome.irradiance.0[1].data;
+    let clipped = |i: usize, p: usize| frames[i].intensity.0.iter().any(|plane| plane.data[p] >= CLIPPED);
+    let information = used
+        .iter()
+        .map(|&i| {
+            // From the result's unit to the frame's exposure.
+            let gain = frames[i].exposure_time / scale;
+            let curve = noise.curve(response, 1, frames[i].levels);
+            let last = (curve.len() - 1) as f64;
+            let data = (0..width * height)
+                .into_par_iter()
+                .map(|p| {
+                    if clipped(i, p) {
+                        return 0.0;
+                    }
+                    let x = (f64::from(result[p]) * gain).clamp(0.0, 1.0);
+                    let deviation = f64::from(curve[(x.sqrt() * last) as usize]) / gain;
+                    (1.0 / (deviation * deviation)) as f32
+                })
+                .collect();
+            (i, Plane { width, height, data })
+        })
+        .collect();
+    let n = used.len().max(1) as f32;
+    let saturation = (0..width * height).into_par_iter().map(|p| used.iter().filter(|&&i| clipped(i, p)).count() as f32 / n).collect();
+    Grounds { information, saturation: Plane { width, height, data: saturation } }
+}
+
+/// The further channels: `confidence.Y`, E/(E + its standard deviation) by what noise allows, 0..=1; `saturation.Y`, the part of the used
+/// frames that are clipped; `residual.Y`, the largest local χ² of the frames (1 is what noise explains); `weight.frameN`, the part of the
+/// information that comes from frame N.
+pub fn layers(bracket: &Bracket, response: &Response, outcome: &Outcome) -> Vec<(String, Plane)> {
+    let grounds = grounds(bracket, response, outcome);
+    let (width, height) = bracket.size();
+    let count = width * height;
+    let mut total = vec![0f32; count];
+    for (_, plane) in &grounds.information {
+        total.iter_mut().zip(&plane.data).for_each(|(t, v)| *t += v);
+    }
+    let of = |f: &(dyn Fn(usize) -> f32 + Sync)| Plane { width, height, data: (0..count).into_par_iter().map(f).collect() };
+    let result = &outcome.irradiance.0[1].data;
+    let confidence = of(&|p| if total[p] > 0.0 { result[p] / (result[p] + total[p].sqrt().recip()) } else { 0.0 });
+    let residual = of(&|p| outcome.misfit.iter().flatten().map(|m| m.data[p]).filter(|v| v.is_finite()).fold(0.0, f32::max));
+    let mut layers = vec![
+        ("confidence.Y".to_string(), confidence),
+        ("saturation.Y".to_string(), grounds.saturation),
+        ("residual.Y".to_string(), residual),
+    ];
+    for (i, plane) in grounds.information {
+        layers.push((format!("weight.frame{}", i + 1), of(&|p| if total[p] > 0.0 { plane.data[p] / total[p] } else { 0.0 })));
+    }
+    layers
+}

@@ -1,0 +1,281 @@
+//! Many photographs: grouping, shards, resuming, failures; configuration, voices, interruption.
+
+use crate::support::files::{listing, scene};
+use crate::support::photos::{self, Notes};
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use tempfile::{TempDir, tempdir};
+
+struct Said {
+    code: Option<i32>,
+    out: String,
+    err: String,
+}
+
+fn unshaken(folder: &Path, arguments: &[&str]) -> Said {
+    let out = Command::new(env!("CARGO_BIN_EXE_unshaken"))
+        .current_dir(folder)
+        .env("XDG_CONFIG_HOME", folder.join("settings"))
+        // Where there is no desktop, a graphics driver complains that this is not set.
+        .env("XDG_RUNTIME_DIR", folder)
+        .args(arguments)
+        .output()
+        .expect("the program runs");
+    let text = |b: &[u8]| String::from_utf8_lossy(b).into_owned();
+    Said { code: out.status.code(), out: text(&out.stdout), err: text(&out.stderr) }
+}
+
+/// A JPEG of a part of the scene at `time` = a/b seconds, taken at 12:`clock`.
+fn photograph(path: &Path, size: (u32, u32), time: (u32, u32), clock: &'static str) {
+    let s = scene(size.0 as usize, size.1 as usize, 1.5);
+    let seconds = f64::from(time.0) / f64::from(time.1);
+    let picture = image::RgbImage::from_fn(size.0, size.1, |x, y| {
+        let e = f64::from(s.at(x as usize, y as usize)) * seconds;
+        image::Rgb([(e.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8; 3])
+    });
+    photos::write_jpeg(path, &picture, &Notes { time: Some(time), taken: Some(clock), ..Notes::default() });
+}
+
+/// Three brackets of two frames, one of another size, a lone frame and a file without notes.
+fn album() -> TempDir {
+    let dir = tempdir().unwrap();
+    let photos = dir.path().join("photos");
+    std::fs::create_dir(&photos).unwrap();
+    for (name, size, time, clock) in [
+        ("p1.jpg", (72, 56), (1, 8), "2024:05:06 12:00:00"),
+        ("p2.jpg", (72, 56), (1, 1), "2024:05:06 12:00:01"),
+        // At once, with the first exposure again: the next bracket.
+        ("p3.jpg", (72, 56), (1, 8), "2024:05:06 12:00:03"),
+        ("p4.jpg", (72, 56), (1, 1), "2024:05:06 12:00:04"),
+        // Another size.
+        ("p5.jpg", (64, 48), (1, 4), "2024:05:06 12:00:06"),
+        ("p6.jpg", (64, 48), (2, 1), "2024:05:06 12:00:07"),
+        // Much later, alone.
+        ("p7.jpg", (64, 48), (1, 4), "2024:05:06 13:00:00"),
+    ] {
+        photograph(&photos.join(name), size, time, clock);
+    }
+    image::RgbImage::new(40, 40).save(photos.join("z.png")).unwrap();
+    std::fs::write(photos.join("notes.txt"), "no photograph").unwrap();
+    dir
+}
+
+#[test]
+fn brackets_are_found_by_time_size_and_exposure() {
+    let dir = album();
+    let said = unshaken(dir.path(), &["batch", "photos", "--output-dir", "out", "--dry-run"]);
+    assert_eq!(said.code, Some(0), "{}", said.err);
+    let manifest: toml::Table = said.out.parse().unwrap();
+    let found: Vec<(String, Vec<String>)> = manifest["bracket"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|b| {
+            (b["name"].as_str().unwrap().into(), b["frames"].as_array().unwrap().iter().map(|f| f.as_str().unwrap().to_string()).collect())
+        })
+        .collect();
+    let pair = |name: &str, a: &str, b: &str| (name.to_string(), vec![format!("photos/{a}.jpg"), format!("photos/{b}.jpg")]);
+    assert_eq!(found, [pair("p1", "p1", "p2"), pair("p3", "p3", "p4"), pair("p5", "p5", "p6")]);
+    assert!(said.out.contains("# photos/p7.jpg: is alone") && said.out.contains("# photos/z.png: notes no exposure"), "{}", said.out);
+    assert!(said.out.contains("Maker Model 1; +0.0, +3.0 EV"), "{}", said.out);
+    assert!(!dir.path().join("out").exists(), "a dry run writes nothing");
+    // A shorter gap than the pause between the frames.
+    let said = unshaken(dir.path(), &["batch", "photos", "--output-dir", "out", "--dry-run", "--gap", "0.2"]);
+    assert!(!said.out.contains("[[bracket]]"), "{}", said.out);
+}
+
+/// Every bracket of exactly one shard, for all counts.
+#[test]
+fn shards_are_an_exact_partition() {
+    let dir = tempdir().unwrap();
+    let mut manifest = String::new();
+    for i in 0..7 {
+        manifest += &format!("[[bracket]]\nname = \"b{i}\"\nframes = [\"none{i}a.jpg\", \"none{i}b.jpg\"]\n");
+    }
+    std::fs::write(dir.path().join("m.toml"), manifest).unwrap();
+    for count in [1, 3, 8] {
+        let mut seen: Vec<String> = Vec::new();
+        for i in 1..=count {
+            let shard = format!("{i}/{count}");
+            let said = unshaken(dir.path(), &["batch", "--manifest", "m.toml", "--output-dir", "out", "--shard", &shard, "--json"]);
+            // Frames that are not there: each bracket fails, and the next one is tried.
+            let events = said.out.lines().filter_map(|l| serde_json::from_str::<Value>(l).ok()).filter(|e| e["event"] == "bracket");
+            seen.extend(events.map(|e| {
+                assert_eq!(e["status"], "failed");
+                assert!(e["note"].as_str().unwrap().contains("cannot be read"), "{e}");
+                e["name"].as_str().unwrap().to_string()
+            }));
+            assert_eq!(said.code, Some(i32::from(i <= 7)), "shard {shard}: {}", said.err);
+        }
+        seen.sort();
+        assert_eq!(seen, (0..7).map(|i| format!("b{i}")).collect::<Vec<_>>(), "{count} shards");
+    }
+    for wrong in ["0/3", "4/3", "1", "a/b", "1/0"] {
+        let said = unshaken(dir.path(), &["batch", "--manifest", "m.toml", "--output-dir", "out", "--shard", wrong]);
+        assert!(said.code == Some(2) && said.err.contains("--shard"), "{wrong}: {}", said.err);
+    }
+}
+
+#[test]
+fn a_batch_goes_on_after_a_failure_and_resumes() {
+    let dir = album();
+    let at = |name: &str| dir.path().join(name);
+    std::fs::write(
+        at("m.toml"),
+        "[[bracket]]\nname = \"good\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nresponse = \"gamma:2.2\"\n\
+         [[bracket]]\nname = \"bad\"\nframes = [\"photos/p1.jpg\", \"photos/p5.jpg\"]\n\
+         [[bracket]]\nname = \"other\"\nframes = [\"photos/p5.jpg\", \"photos/p6.jpg\"]\nsharp = \"1,2\"\n",
+    )
+    .unwrap();
+    let run = |more: &[&str]| unshaken(dir.path(), &[&["batch", "--manifest", "m.toml", "--output-dir", "out"], more].concat());
+    let status = |said: &Said| -> Vec<String> {
+        let rows = said.out.lines().skip(1).take(3);
+        rows.map(|l| l.split_whitespace().filter(|w| ["done", "degraded", "failed", "skipped"].contains(w)).take(1).collect::<String>())
+            .collect()
+    };
+    let said = run(&["--jobs", "2"]);
+    assert_eq!(said.code, Some(1), "{}{}", said.out, said.err);
+    let first = status(&said);
+    assert_eq!(first[1], "failed");
+    assert!(first[0] != "failed" && first[2] != "failed", "{}{}", said.out, said.err);
+    assert!(said.out.contains("one size"), "the table says why: {}", said.out);
+    assert_eq!(listing(&at("out")), [".unshaken", "good.exr", "good.jpg", "good.json", "other.exr", "other.jpg", "other.json"]);
+    let stamp = |name: &str| std::fs::metadata(at(name)).unwrap().modified().unwrap();
+    let before = stamp("out/good.exr");
+
+    let again = run(&[]);
+    assert_eq!(status(&again), ["skipped", "failed", "skipped"], "{}", again.out);
+    assert_eq!(stamp("out/good.exr"), before);
+    // Another content, or another option, is another result.
+    photograph(&at("photos/p6.jpg"), (64, 48), (2, 1), "2024:05:06 12:00:09");
+    let changed = run(&[]);
+    assert_eq!((status(&changed)[0].as_str(), status(&changed)[2] != "skipped"), ("skipped", true), "{}", changed.out);
+    // What somebody else put there stays.
+    std::fs::remove_dir_all(at("out/.unshaken")).unwrap();
+    let refused = run(&[]);
+    assert!(refused.code == Some(1) && refused.out.contains("--overwrite"), "{}", refused.out);
+    assert_eq!(stamp("out/good.exr"), before);
+}
+
+#[test]
+fn configuration_preset_and_command_line_in_that_order() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    std::fs::create_dir_all(at("settings/unshaken")).unwrap();
+    std::fs::write(
+        at("settings/unshaken/config.toml"),
+        "alpha = 0.5\nhalf = true\nresponse = \"linear\"\n[preset.mine]\nalpha = 0.7\nlayers = true\n",
+    )
+    .unwrap();
+    std::fs::write(at("other.toml"), "sharp = [1, 2]\n").unwrap();
+    let config = |arguments: &[&str]| -> toml::Table {
+        let said = unshaken(dir.path(), &[&["merge", "--print-config"], arguments].concat());
+        assert_eq!(said.code, Some(0), "{}", said.err);
+        said.out.parse().unwrap()
+    };
+    let text =
+        |t: &toml::Table, key: &str| t.get(key).map(|v| v.as_str().map_or_else(|| v.to_string(), str::to_string)).unwrap_or_default();
+    let file = config(&[]);
+    assert_eq!((text(&file, "alpha"), text(&file, "half"), text(&file, "layers")), ("0.5".into(), "true".into(), "false".into()));
+    let preset = config(&["--preset", "mine"]);
+    assert_eq!((text(&preset, "alpha"), text(&preset, "half"), text(&preset, "layers")), ("0.7".into(), "true".into(), "true".into()));
+    let line = config(&["--preset", "mine", "--alpha", "0.9"]);
+    assert_eq!((text(&line, "alpha"), text(&line, "response")), ("0.9".into(), "linear".into()));
+    let other = config(&["--config", "other.toml"]);
+    assert_eq!((text(&other, "sharp"), text(&other, "alpha")), ("1,2".into(), String::new()));
+    assert_eq!(text(&config(&["--config", "none", "--preset", "archive"]), "primaries"), "acescg");
+    // What is printed is a configuration again.
+    let printed = unshaken(dir.path(), &["merge", "--print-config", "--preset", "mine"]).out;
+    std::fs::write(at("again.toml"), &printed).unwrap();
+    assert_eq!(config(&["--config", "again.toml"]), preset);
+    for (content, word) in
+        [("alfa = 1\n", "alfa"), ("half = \"yes\"\n", "neither true nor false"), ("output = \"x\"\n", "output"), ("= 3", "TOML")]
+    {
+        std::fs::write(at("wrong.toml"), content).unwrap();
+        let said = unshaken(dir.path(), &["merge", "--config", "wrong.toml", "-o", "x.exr", "a.png", "b.png"]);
+        assert!(said.code == Some(1) && said.err.contains("wrong.toml") && said.err.contains(word), "{content}: {}", said.err);
+    }
+    let said = unshaken(dir.path(), &["merge", "--preset", "none-such", "-o", "x.exr", "a.png", "b.png"]);
+    assert!(said.code == Some(2) && said.err.contains("archive"), "{}", said.err);
+}
+
+#[test]
+fn completions_and_the_manual_page_know_every_command() {
+    let dir = tempdir().unwrap();
+    for what in ["bash", "zsh", "fish", "man"] {
+        let said = unshaken(dir.path(), &["generate", what]);
+        assert_eq!(said.code, Some(0), "{}", said.err);
+        for word in ["merge", "batch", "tonemap", "output-dir", "primaries", "shard"] {
+            assert!(said.out.replace("\\-", "-").contains(word), "{what} lacks {word}");
+        }
+    }
+    for command in ["merge", "batch"] {
+        assert!(unshaken(dir.path(), &[command, "--help"]).out.contains("Examples:"), "{command}");
+    }
+}
+
+#[test]
+fn voices_quiet_and_json() {
+    let dir = album();
+    let frames = ["photos/p1.jpg", "photos/p2.jpg"];
+    let quiet = unshaken(dir.path(), &[&["merge", "--quiet", "--sharp", "1,2", "-o", "q.exr"], &frames[..]].concat());
+    assert_eq!((quiet.code, quiet.out.as_str(), quiet.err.as_str()), (Some(0), "", ""));
+    let json = unshaken(dir.path(), &[&["merge", "--json", "--sharp", "1", "--exclude", "2", "-o", "j.exr"], &frames[..]].concat());
+    assert_eq!((json.code, json.err.as_str()), (Some(0), ""));
+    let events: Vec<Value> = json.out.lines().map(|l| serde_json::from_str(l).expect("JSON on every line")).collect();
+    let fractions: Vec<f64> = events.iter().filter(|e| e["event"] == "progress").map(|e| e["fraction"].as_f64().unwrap()).collect();
+    assert!(fractions.len() >= 3 && fractions.windows(2).all(|w| w[1] >= w[0]), "{fractions:?}");
+    assert!(events.iter().any(|e| e["event"] == "warning" && e["text"].as_str().unwrap().contains("leaves one frame")));
+    assert_eq!(events.last().map(|e| (&e["event"], &e["output"])), Some((&Value::from("done"), &Value::from("j.exr"))));
+    let failed = unshaken(dir.path(), &["merge", "--json", "-o", "j.exr", "photos/p1.jpg", "none.jpg"]);
+    assert!(failed.code == Some(1) && failed.out.lines().last().unwrap().contains("\"event\":\"error\""), "{}", failed.out);
+}
+
+/// A bracket of which nothing can be deblurred: done, and degraded under --strict.
+#[test]
+fn strict_tells_degraded_results_by_the_exit_code() {
+    let dir = album();
+    let tsf = r#"{"format":"unshaken-tsf","version":1,"frames":[{"frame":"p1.jpg","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1}]}]}"#;
+    std::fs::write(dir.path().join("tsf.json"), tsf).unwrap();
+    // The TSF file holds one frame of two: a warning of the merge.
+    let merge = |more: &[&str]| {
+        unshaken(
+            dir.path(),
+            &[&["merge", "--overwrite", "--sharp", "1,2", "-o", "s.exr", "--tsf", "tsf.json"], more, &["photos/p1.jpg", "photos/p2.jpg"]]
+                .concat(),
+        )
+    };
+    let plain = merge(&[]);
+    assert!(plain.code == Some(0) && plain.err.contains("its TSF is estimated"), "{}", plain.err);
+    assert_eq!(merge(&["--strict"]).code, Some(3));
+    let fine = unshaken(dir.path(), &["merge", "--strict", "--sharp", "1,2", "-o", "t.exr", "photos/p1.jpg", "photos/p2.jpg"]);
+    assert_eq!(fine.code, Some(0), "a note about the response is no degradation: {}", fine.err);
+}
+
+/// Ctrl-C in the middle: exit code 130, nothing new in the folder.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_merge_leaves_nothing() {
+    let dir = tempdir().unwrap();
+    for (name, time) in [("a.jpg", (1, 8)), ("b.jpg", (1, 2)), ("c.jpg", (2, 1))] {
+        photograph(&dir.path().join(name), (700, 500), time, "2024:05:06 12:00:00");
+    }
+    let before = listing(dir.path());
+    let mut child = Command::new(env!("CARGO_BIN_EXE_unshaken"))
+        .current_dir(dir.path())
+        .args(["merge", "-o", "x.exr", "--preview", "x.png", "--sharp", "1", "a.jpg", "b.jpg", "c.jpg"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(child.try_wait().unwrap().is_none(), "it is still at work");
+    let start = Instant::now();
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let code = child.wait().unwrap().code();
+    assert_eq!(code, Some(130));
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    assert_eq!(listing(dir.path()), before);
+}

@@ -1,0 +1,457 @@
+//! Photographers' files: raw, notes, profiles, primaries; what results say of themselves.
+
+use crate::support::files::{scene, shared};
+use crate::support::photos::{self, Notes};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use tempfile::tempdir;
+use unshaken::colour::{self, Primaries};
+use unshaken::image::{Plane, Rgb};
+use unshaken::io::exr::{self, Radiometry, Style};
+use unshaken::io::input::{self, Encoding};
+use unshaken::io::metadata::{self, Metadata};
+use unshaken::io::output::Output;
+use unshaken::response::Response;
+
+/// Smooth, of all hues, 0.02 to 0.4.
+fn colours(width: usize, height: usize) -> Rgb {
+    let s = scene(width, height, 1.3);
+    let hue = |c: usize, x: usize, y: usize| 0.5 + 0.4 * ((x as f32 / 17.0 + y as f32 / 23.0) + 2.1 * c as f32).sin();
+    Rgb(std::array::from_fn(|c| Plane::from_fn(width, height, |x, y| 0.45 * s.at(x, y) * hue(c, x, y))))
+}
+
+fn in_rec709(image: &Rgb, to_xyz: &colour::Matrix) -> Rgb {
+    let mut out = image.clone();
+    colour::convert(&mut out, &colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).unwrap(), to_xyz));
+    out
+}
+
+/// Root mean square relative difference, away from the border.
+fn difference(a: &Rgb, b: &Rgb) -> f64 {
+    assert_eq!(a.size(), b.size());
+    let (w, h) = a.size();
+    let inside = |c: usize| (4..h - 4).flat_map(move |y| (4..w - 4).map(move |x| (c, x, y)));
+    let squares: Vec<f64> = (0..3)
+        .flat_map(inside)
+        .map(|(c, x, y)| (f64::from(a.0[c].at(x, y) - b.0[c].at(x, y)) / f64::from(b.0[c].at(x, y)).max(0.01)).powi(2))
+        .collect();
+    (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+}
+
+#[test]
+fn raw_frames_come_with_the_cameras_white_balance_and_colours() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    let truth = colours(96, 64);
+    std::fs::write(&path, photos::dng(&truth, &Notes::default())).unwrap();
+    let frame = input::read(&path, 1.0).unwrap();
+    assert_eq!((&frame.encoding, frame.raw, frame.intensity.size()), (&Encoding::Linear, true, (96, 64)));
+    // Camera RGB: what the sensor recorded, before white balance.
+    let sensor = Rgb(std::array::from_fn(|c| truth.0[c].map(|v| v * photos::NEUTRAL[c] as f32)));
+    let off = difference(&frame.intensity, &sensor);
+    assert!(off < 0.04, "camera RGB is off by {off:.3}");
+    let off = difference(&in_rec709(&frame.intensity, &frame.to_xyz), &truth);
+    assert!(off < 0.06, "Rec. 709 is off by {off:.3}");
+    // An even grey stays grey to a per mille.
+    std::fs::write(&path, photos::dng(&Rgb::filled(32, 32, 0.3), &Notes::default())).unwrap();
+    let frame = input::read(&path, 1.0).unwrap();
+    let grey = in_rec709(&frame.intensity, &frame.to_xyz).pixel(16 * 32 + 16);
+    assert!(grey.iter().all(|v| (v - 0.3).abs() < 3e-4), "{grey:?}");
+    let m = &frame.metadata;
+    assert_eq!((m.exposure_time, m.f_number, m.iso), (Some(0.125), Some(5.6), Some(200.0)));
+    assert_eq!((m.make.as_deref(), m.model.as_deref()), (Some("Maker"), Some("Model 1")));
+}
+
+#[test]
+fn raw_saturation_masks_and_orientation_turns() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    // Green and then red saturate at a bright disc; red's sensor holds twice as much.
+    let level = |x: usize, y: usize, l: f32| if (x as f32 - 40.0).hypot(y as f32 - 30.0) < 8.0 { l } else { 0.1 };
+    for (l, red) in [(1.5f32, false), (2.5, true)] {
+        let plane = Plane::from_fn(96, 64, |x, y| level(x, y, l));
+        std::fs::write(&path, photos::dng(&Rgb([plane.clone(), plane.clone(), plane]), &Notes::default())).unwrap();
+        let frame = input::read(&path, 1.0).unwrap().intensity;
+        assert_eq!(frame.0[1].at(40, 30), 1.0);
+        assert_eq!(frame.0[0].at(40, 30) == 1.0, red, "{l}: {}", frame.0[0].at(40, 30));
+        assert!(frame.0.iter().all(|p| p.at(10, 10) < 0.2));
+    }
+    let truth = colours(40, 24);
+    let read = |orientation| {
+        std::fs::write(&path, photos::dng(&truth, &Notes { orientation, ..Notes::default() })).unwrap();
+        input::read(&path, 1.0).unwrap().intensity
+    };
+    let (upright, turned) = (read(1), read(6));
+    assert_eq!(turned.size(), (24, 40), "6: the camera was turned, the picture's right is its bottom");
+    // Top left of the file becomes top right.
+    for (x, y) in [(0, 0), (5, 7), (39, 23)] {
+        assert_eq!(turned.0[1].at(23 - y, x), upright.0[1].at(x, y));
+    }
+}
+
+#[test]
+fn raw_files_that_cannot_be_developed_are_refused() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    let whole = photos::dng(&colours(64, 48), &Notes::default());
+    let error = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        input::read(&path, 1.0).map(|i| i.intensity.size()).unwrap_err().to_string()
+    };
+    for bytes in [&whole[..whole.len() / 2], &whole[..200], b"II*\0\x08\0\0\0", b"nothing", b""] {
+        let text = error(bytes);
+        assert!(text.contains("a.dng") && (text.contains("copy it again") || text.contains("DNG")) && text.lines().count() == 1, "{text}");
+    }
+    // Every byte of the header wrong, one at a time: an error or a picture, never a panic.
+    for at in 0..600 {
+        let mut bytes = whole.clone();
+        bytes[at] ^= 0xff;
+        std::fs::write(&path, &bytes).unwrap();
+        let _ = input::read(&path, 1.0);
+    }
+}
+
+#[test]
+fn a_real_dng_decodes_and_its_missing_times_are_refused() {
+    let Some(chart) = shared("data/raw/colorchart.dng") else { return };
+    let frame = input::read(&chart, 1.0).unwrap();
+    let (w, h) = frame.intensity.size();
+    assert!(w > 500 && h > 300, "{w} x {h}");
+    let rgb = in_rec709(&frame.intensity, &frame.to_xyz);
+    let means = rgb.0.each_ref().map(|p| p.data.iter().sum::<f32>() / (w * h) as f32);
+    assert!(means.iter().all(|m| *m > 0.01 && *m < 0.9), "{means:?}");
+    let error = metadata::exposures(&[(chart.clone(), &frame.metadata)]).unwrap_err().to_string();
+    assert!(error.contains("colorchart.dng") && error.contains("--exposures"), "{error}");
+}
+
+fn noted(time: Option<f64>, f_number: Option<f64>, iso: Option<f64>, bias: Option<f64>) -> Metadata {
+    let mut noted = Metadata::default();
+    (noted.exposure_time, noted.f_number, noted.iso, noted.exposure_bias) = (time, f_number, iso, bias);
+    noted
+}
+
+fn exposures(list: &[Metadata]) -> Result<(Vec<f64>, Vec<String>), String> {
+    let pairs: Vec<_> = list.iter().enumerate().map(|(i, m)| (PathBuf::from(format!("f{i}.jpg")), m)).collect();
+    metadata::exposures(&pairs).map_err(|e| e.to_string())
+}
+
+#[test]
+fn time_aperture_and_speed_make_the_exposure() {
+    let plain = exposures(&[noted(Some(0.1), Some(8.0), Some(100.0), None), noted(Some(0.4), Some(8.0), Some(100.0), None)]).unwrap();
+    assert_eq!(plain, (vec![0.1, 0.4], vec![]));
+    // A bracket by aperture: f/4 lets in four times as much as f/8; one by speed.
+    let (times, notes) =
+        exposures(&[noted(Some(0.1), Some(8.0), Some(100.0), None), noted(Some(0.1), Some(4.0), Some(200.0), None)]).unwrap();
+    assert!((times[1] / times[0] - 8.0).abs() < 1e-9, "{times:?}");
+    assert!(notes.len() == 2 && notes[0].contains("aperture (8, 4)") && notes[1].contains("ISO speed (100, 200)"), "{notes:?}");
+    // Noted by some only: nothing is guessed.
+    let error = exposures(&[noted(Some(0.1), Some(8.0), None, None), noted(Some(0.4), None, None, None)]).unwrap_err();
+    assert!(error.contains("f1.jpg") && error.contains("aperture") && error.contains("--exposures"), "{error}");
+    let error = exposures(&[noted(Some(0.1), None, Some(100.0), None), noted(Some(0.4), None, None, None)]).unwrap_err();
+    assert!(error.contains("ISO speed"), "{error}");
+    let error = exposures(&[noted(Some(0.0), None, None, None), noted(Some(0.4), None, None, None)]).unwrap_err();
+    assert!(error.contains("f0.jpg") && error.contains("0 s"), "{error}");
+}
+
+#[test]
+fn exposure_bias_stands_in_for_missing_times_and_says_so() {
+    let (times, notes) = exposures(&[noted(None, None, None, Some(-2.0)), noted(None, None, None, Some(1.0))]).unwrap();
+    assert!((times[1] / times[0] - 8.0).abs() < 1e-12 && notes[0].contains("-2.0, +1.0 EV"), "{times:?} {notes:?}");
+    for wrong in [[Some(0.0), Some(0.0)], [Some(0.0), None]] {
+        let error = exposures(&wrong.map(|b| noted(None, None, None, b))).unwrap_err();
+        assert!(error.contains("no exposure time") && error.contains("--ev"), "{error}");
+    }
+    let error = exposures(&[noted(Some(0.1), None, None, Some(0.0)), noted(None, None, None, Some(2.0))]).unwrap_err();
+    assert!(error.contains("f1.jpg"), "{error}");
+}
+
+#[test]
+fn notes_of_a_jpeg_are_read() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.jpg");
+    let notes =
+        Notes { taken: Some("2024:05:06 07:08:09"), artist: Some("A. Person"), bias: Some((-4, 2)), orientation: 6, ..Notes::default() };
+    photos::write_jpeg(&path, &image::RgbImage::new(24, 16), &notes);
+    let m = metadata::read(&path).unwrap();
+    assert_eq!((m.exposure_time, m.f_number, m.iso, m.exposure_bias), (Some(0.125), Some(5.6), Some(200.0), Some(-2.0)));
+    assert_eq!((m.taken.as_deref(), m.artist.as_deref(), m.latitude), (Some("2024:05:06 07:08:09"), Some("A. Person"), Some(-33.5)));
+    assert_eq!(input::read(&path, 1.0).unwrap().intensity.size(), (16, 24), "upright");
+    // 78/0.65 N²/(S t).
+    assert!((m.white_luminance().unwrap() - 120.0 * 5.6 * 5.6 / (200.0 * 0.125)).abs() < 1e-6);
+
+    // What a result inherits: people, camera, place, not geometry.
+    let inherited = metadata::read_bytes(&png_with(&m.exif_block().unwrap()));
+    assert_eq!((inherited.artist.as_deref(), inherited.latitude, inherited.exposure_time), (Some("A. Person"), Some(-33.5), Some(0.125)));
+    let exif = exif::Reader::new().read_raw(m.exif_block().unwrap()).unwrap();
+    for tag in [exif::Tag::Orientation, exif::Tag::XResolution, exif::Tag::PixelXDimension] {
+        assert!(exif.get_field(tag, exif::In::PRIMARY).is_none(), "{tag}");
+    }
+    assert!(exif.get_field(exif::Tag::Software, exif::In::PRIMARY).unwrap().display_value().to_string().contains("unshaken"));
+}
+
+fn png_with(exif: &[u8]) -> Vec<u8> {
+    use image::ImageEncoder;
+    let mut bytes = Vec::new();
+    let mut encoder = image::codecs::png::PngEncoder::new(&mut bytes);
+    encoder.set_exif_metadata(exif.to_vec()).unwrap();
+    image::RgbImage::new(2, 2).write_with_encoder(encoder).unwrap();
+    bytes
+}
+
+#[test]
+fn dates_are_seconds() {
+    let seconds = |t: &str| metadata::seconds(t);
+    assert_eq!(seconds("1970:01:01 00:00:00"), Some(0.0));
+    assert_eq!(seconds("2024:02:29 12:00:00.25"), Some(1_709_208_000.25));
+    assert_eq!(seconds("2024:03:01 12:00:00").unwrap() - seconds("2024:02:29 12:00:00").unwrap(), 86400.0);
+    for wrong in ["", "0000:00:00 00:00:00", "2024:13:01 00:00:00", "yesterday noon", "2024:01:01"] {
+        assert_eq!(seconds(wrong), None, "{wrong}");
+    }
+}
+
+/// PNG files that embed profiles of other primaries and curves: the same colours come out.
+#[test]
+fn embedded_profiles_are_honoured() {
+    use image::ImageEncoder;
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.png");
+    let truth = [0.30f64, 0.20, 0.12];
+    for (profile, to_xyz, curve) in [
+        (moxcms::ColorProfile::new_display_p3(), Primaries::DisplayP3.to_xyz(), Response::Srgb),
+        (
+            moxcms::ColorProfile::new_adobe_rgb(),
+            colour::from_chromaticities([[0.64, 0.33], [0.21, 0.71], [0.15, 0.06], colour::D65]).unwrap(),
+            Response::Gamma(2.199_22),
+        ),
+    ] {
+        let own = colour::apply(&colour::product(&colour::inverse(&to_xyz).unwrap(), &Primaries::Rec709.to_xyz()), truth);
+        let code = own.map(|v| {
+            let encoded = match curve {
+                Response::Srgb => 1.055 * v.powf(1.0 / 2.4) - 0.055,
+                _ => v.powf(1.0 / 2.199_22),
+            };
+            (encoded * 65535.0).round() as u16
+        });
+        let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(&path).unwrap());
+        encoder.set_icc_profile(profile.encode().unwrap()).unwrap();
+        let picture = image::ImageBuffer::<image::Rgb<u16>, _>::from_pixel(8, 6, image::Rgb(code));
+        picture.write_with_encoder(encoder).unwrap();
+        let frame = input::read(&path, 1.0).unwrap();
+        let response = match &frame.encoding {
+            Encoding::Camera => Response::Srgb,
+            Encoding::Profile(_, r) => r.clone(),
+            Encoding::Linear => panic!("not linear"),
+        };
+        let z = frame.intensity.pixel(0);
+        let light = std::array::from_fn(|c| response.inverse(c, f64::from(z[c])));
+        let back = colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).unwrap(), &frame.to_xyz);
+        let got = colour::apply(&back, light);
+        assert!(got.iter().zip(truth).all(|(a, b)| (a - b).abs() < 1.5e-3), "{:?}: {got:?}, expected {truth:?}", frame.encoding);
+    }
+    // A damaged profile is not passed over.
+    let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(&path).unwrap());
+    encoder.set_icc_profile(vec![7; 200]).unwrap();
+    image::RgbImage::new(4, 4).write_with_encoder(encoder).unwrap();
+    let error = input::read(&path, 1.0).unwrap_err().to_string();
+    assert!(error.contains("ICC profile"), "{error}");
+}
+
+#[test]
+fn linear_files_are_linear_frames() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let truth = colours(40, 30).map_planes(|p| p.map(|v| 4.0 * v));
+    let radiometry = Radiometry { exposure_time: 0.5, frame: "x".into() };
+    for name in ["a.exr", "a.hdr", "a.tif"] {
+        let (staged, clipped) = Output::check(&at(name), true).unwrap().stage_linear(&truth, &radiometry, &Style::default()).unwrap();
+        staged.commit().unwrap();
+        assert_eq!(clipped, 0.0);
+        let frame = input::read(&at(name), 4.0).unwrap();
+        assert_eq!(frame.encoding, Encoding::Linear, "{name}");
+        // Radiance HDR has steps of 1 %.
+        let off = difference(&in_rec709(&frame.intensity, &frame.to_xyz).map_planes(|p| p.map(|v| 4.0 * v)), &truth);
+        assert!(off < if name == "a.hdr" { 0.02 } else { 1e-4 }, "{name}: {off}");
+        // Above white everything is clipped.
+        assert!(input::read(&at(name), 0.05).unwrap().intensity.0[0].data.contains(&1.0));
+        let linear = input::read_linear(&at(name)).unwrap();
+        assert!(difference(&in_rec709(&linear.image, &linear.to_xyz), &truth) < 0.02, "{name}");
+    }
+    // Sixteen bits clip at 1 and tell.
+    let style = Style { half: true, ..Style::default() };
+    let (staged, clipped) = Output::check(&at("b.tif"), true).unwrap().stage_linear(&truth, &radiometry, &style).unwrap();
+    staged.commit().unwrap();
+    let above = truth.0.iter().flat_map(|p| &p.data).filter(|v| **v > 1.0).count() as f64 / (3.0 * 40.0 * 30.0);
+    assert!(above > 0.0 && (clipped - above).abs() < 1e-9);
+    assert!(matches!(image::open(at("b.tif")).unwrap(), image::DynamicImage::ImageRgb16(_)));
+}
+
+#[test]
+fn frames_with_nan_are_refused() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.tif");
+    let mut pixels = image::Rgb32FImage::from_pixel(6, 4, image::Rgb([0.5f32; 3]));
+    pixels.put_pixel(3, 2, image::Rgb([0.5, f32::NAN, 0.5]));
+    image::DynamicImage::ImageRgb32F(pixels).save(&path).unwrap();
+    let error = input::read(&path, 1.0).unwrap_err().to_string();
+    assert!(error.contains("a.tif") && error.contains("NaN") && error.contains("(3, 2)"), "{error}");
+}
+
+#[test]
+fn primaries_convert_exactly_and_say_what_they_lose() {
+    // Lindbloom's sRGB to XYZ relative to D50 (Bradford), and Rec. 2020 from Rec. 709 by ITU-R BT.2087.
+    let srgb = Primaries::Rec709.to_xyz();
+    let expected = [[0.4360747, 0.3850649, 0.1430804], [0.2225045, 0.7168786, 0.0606169], [0.0139322, 0.0971045, 0.7141733]];
+    assert!((0..3).all(|i| (0..3).all(|j| (srgb[i][j] - expected[i][j]).abs() < 1e-3)), "{srgb:?}");
+    let m = colour::product(&colour::inverse(&Primaries::Rec2020.to_xyz()).unwrap(), &srgb);
+    let expected = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]];
+    assert!((0..3).all(|i| (0..3).all(|j| (m[i][j] - expected[i][j]).abs() < 2e-4)), "{m:?}");
+    for p in Primaries::ALL {
+        let white = colour::apply(&colour::product(&colour::inverse(&p.to_xyz()).unwrap(), &srgb), [1.0; 3]);
+        assert!(white.iter().all(|v| (v - 1.0).abs() < 1e-6), "{p:?}: white stays white, {white:?}");
+        assert_eq!(Primaries::named(p.name()), Some(p));
+    }
+    // Pure Rec. 2020 green is outside Rec. 709.
+    let mut image = Rgb::filled(10, 10, 0.0);
+    image.0[1] = Plane::from_fn(10, 10, |x, _| if x < 5 { 1.0 } else { 0.0 });
+    let outside = colour::convert(&mut image, &colour::inverse(&m).unwrap());
+    assert!((outside - 0.5).abs() < 1e-9 && image.0[0].data.iter().all(|v| *v == 0.0), "{outside}");
+    assert!(colour::inverse(&[[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 1.0, 0.0]]).is_none());
+    assert!(colour::inverse(&[[f64::NAN; 3]; 3]).is_none());
+}
+
+/// An independent reader (the OpenEXR library's own Python binding) finds the pixels, the channels and the attributes.
+#[test]
+fn other_readers_find_attributes_layers_and_colours() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.exr");
+    let image = colours(24, 16);
+    let notes = Notes { taken: Some("2024:05:06 07:08:09"), artist: Some("A. Person"), ..Notes::default() };
+    let metadata = metadata::read_bytes(&png_with(&notes.exif()));
+    let layers = vec![("confidence.Y".to_string(), Plane::filled(24, 16, 0.25))];
+    let style = Style { primaries: Primaries::Rec2020, half: true, metadata, absolute: None, layers };
+    let radiometry = Radiometry { exposure_time: 0.125, frame: "a.jpg".into() };
+    Output::check(&path, false).unwrap().stage_linear(&image, &radiometry, &style).unwrap().0.commit().unwrap();
+    let script = r#"
+import OpenEXR, sys, json
+f = OpenEXR.File(sys.argv[1], separate_channels=True)
+h = f.header()
+c = f.channels()
+num = lambda v: float(v)
+print(json.dumps({
+  "channels": sorted(c), "type": str(c["R"].pixels.dtype), "pixel": [num(c[k].pixels[5, 7]) for k in "RGB"],
+  "confidence": num(c["confidence.Y"].pixels[3, 3]), "chromaticities": [num(v) for v in h["chromaticities"]],
+  "expTime": num(h["expTime"]), "aperture": num(h["aperture"]), "isoSpeed": num(h["isoSpeed"]), "capDate": h["capDate"],
+  "owner": h["owner"], "whiteLuminance": num(h["whiteLuminance"]), "comments": h["comments"], "latitude": num(h["latitude"]),
+}))"#;
+    let out = Command::new("python3").args(["-c", script]).arg(&path).output();
+    let known = out.as_ref().is_ok_and(|o| !String::from_utf8_lossy(&o.stderr).contains("No module named"));
+    if !known {
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), "SKIPPED other_readers_find_attributes: python3 with the package OpenEXR is not there");
+        return;
+    }
+    let out = out.unwrap();
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let read: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(read["channels"], serde_json::json!(["B", "G", "R", "confidence.Y"]));
+    assert_eq!(read["type"], "float16");
+    let close = |v: &serde_json::Value, x: f64| (v.as_f64().unwrap() - x).abs() < 1e-3 * x.abs().max(0.1);
+    for c in 0..3 {
+        assert!(close(&read["pixel"][c], f64::from(image.0[c].at(7, 5))), "{read}");
+    }
+    let expected = [0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290];
+    assert!((0..8).all(|i| close(&read["chromaticities"][i], expected[i])), "{read}");
+    assert!(close(&read["expTime"], 0.125) && close(&read["aperture"], 5.6) && close(&read["isoSpeed"], 200.0), "{read}");
+    assert!(
+        close(&read["whiteLuminance"], 120.0 * 5.6 * 5.6 / 25.0) && close(&read["latitude"], -33.5) && close(&read["confidence"], 0.25)
+    );
+    assert_eq!((&read["capDate"], &read["owner"]), (&serde_json::json!("2024:05:06 07:08:09"), &serde_json::json!("A. Person")));
+    assert!(read["comments"].as_str().unwrap().starts_with("1.0 is the white of the reference frame a.jpg"), "{read}");
+    // And our own reader knows the primaries again.
+    let file = exr::read_file(&path).unwrap();
+    assert!(
+        input::same_colours(&file.to_xyz, &Primaries::Rec2020.to_xyz()) && !input::same_colours(&file.to_xyz, &Primaries::Rec709.to_xyz())
+    );
+}
+
+#[test]
+fn half_floats_hold_no_more_than_they_can() {
+    let dir = tempdir().unwrap();
+    let output = Output::check(&dir.path().join("a.exr"), false).unwrap();
+    let style = Style { half: true, ..Style::default() };
+    let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
+    let error = output.stage_linear(&Rgb::filled(4, 4, 1e5), &radiometry, &style).unwrap_err().to_string();
+    assert!(error.contains("100000") && error.contains("--half"), "{error}");
+}
+
+fn unshaken(folder: &Path, arguments: &[&str]) -> (Option<i32>, String) {
+    let out =
+        Command::new(env!("CARGO_BIN_EXE_unshaken")).current_dir(folder).env("XDG_CONFIG_HOME", folder).args(arguments).output().unwrap();
+    (out.status.code(), format!("{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr)))
+}
+
+/// From raw files to every kind of result in one run.
+#[test]
+fn a_dng_bracket_is_merged_in_true_colours() {
+    let dir = tempdir().unwrap();
+    let truth = colours(96, 72);
+    let mut noise = crate::support::files::Noise::new(5);
+    for (name, time) in [("a.dng", (1, 8)), ("b.dng", (1, 2)), ("c.dng", (2, 1))] {
+        let seconds = f64::from(time.0) / f64::from(time.1);
+        let exposed = truth.map_planes(|p| p.map(|v| (f64::from(v) * seconds + 0.002 * noise.normal()) as f32));
+        let notes = Notes { time: Some(time), artist: Some("A. Person"), taken: Some("2024:05:06 07:08:09"), ..Notes::default() };
+        std::fs::write(dir.path().join(name), photos::dng(&exposed, &notes)).unwrap();
+    }
+    let (code, said) = unshaken(
+        dir.path(),
+        &[
+            "merge",
+            "-o",
+            "out.exr",
+            "--preview",
+            "out.jpg",
+            "--report",
+            "out.json",
+            "--report-html",
+            "out.html",
+            "--layers",
+            "--sharp",
+            "1,2,3",
+            "a.dng",
+            "b.dng",
+            "c.dng",
+        ],
+    );
+    assert_eq!(code, Some(0), "{said}");
+    assert!(!said.contains("warning"), "{said}");
+    let file = exr::read_file(&dir.path().join("out.exr")).unwrap();
+    let scale = file.factor.unwrap() as f32;
+    assert_eq!(scale, 2.0, "the longest sharp frame");
+    let off = difference(&file.image, &truth.map_planes(|p| p.map(|v| v * scale)));
+    assert!(off < 0.08, "Rec. 709 irradiance is off by {off:.3}");
+    assert_eq!((file.metadata.artist.as_deref(), file.metadata.iso), (Some("A. Person"), Some(200.0)));
+    let preview = metadata::read(&dir.path().join("out.jpg")).unwrap();
+    assert_eq!(preview.artist.as_deref(), Some("A. Person"));
+    let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("out.json")).unwrap()).unwrap();
+    assert_eq!((&report["response"]["name"], &report["colour"]["primaries"]), (&serde_json::json!("linear"), &serde_json::json!("rec709")));
+    let page = std::fs::read_to_string(dir.path().join("out.html")).unwrap();
+    for part in [
+        "id=\"handle\"",
+        "plain merge",
+        "mask: white counts",
+        "residual over noise",
+        "Gain over deleting",
+        "Convergence",
+        "--primaries",
+        "data:image/jpeg;base64,",
+    ] {
+        assert!(page.contains(part), "the page lacks {part}");
+    }
+    assert!(!page.contains("http"), "nothing from elsewhere");
+
+    let (code, said) = unshaken(dir.path(), &["merge", "-o", "x.exr", "--response", "srgb", "a.dng", "b.dng"]);
+    assert!(code == Some(2) && said.contains("linear already"), "{said}");
+    std::fs::copy(dir.path().join("out.jpg"), dir.path().join("d.jpg")).unwrap();
+    let (code, said) = unshaken(dir.path(), &["merge", "-o", "x.exr", "a.dng", "d.jpg"]);
+    assert!(code == Some(1) && said.contains("d.jpg") && said.contains("one kind"), "{said}");
+}
