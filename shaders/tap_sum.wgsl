@@ -10,14 +10,17 @@
 // `table` starts with the group index, four entries to a vec4i: entry g is where group g begins, entry g + 1 where it ends.
 // A group is its runs one after another; a run is vec4i(place, count, w[0], w[1]) and w[2..count], four to a vec4i, weights as bits.
 // `place` is the index of the run's first load for output pixel (0, 0); the k-th shift reads k values further.
+// Whether to add to what the output holds: no parameter, because software rasterisers run both sides of a branch.
+override ACCUMULATE: bool = false;
+
 struct Params {
     out_size: vec2i,
     in_stride: i32,    // values per row of the input
     in_plane: i32,     // values from one group's plane of the input to the next
     first_group: u32,  // group of invocations with z = 0
     span: u32,         // groups that one invocation sums
-    accumulate: u32,   // 1: add to what the output holds
     out_first: i32,    // row of the binding at which the output begins
+    _pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -97,7 +100,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     for (var c = 0; c < 8; c += 1) {
         // Each pixel has its own guard: an overrun would write into the next row.
         if p.x + c < params.out_size.x {
-            if params.accumulate == 1u {
+            if ACCUMULATE {
                 out_r[o + c] += red[c / 4][c % 4];
                 out_g[o + c] += green[c / 4][c % 4];
                 out_b[o + c] += blue[c / 4][c % 4];

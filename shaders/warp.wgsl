@@ -2,6 +2,8 @@
 // weights; four pixels of a row per invocation. Rotate-then-shift: one base per plane of the output (invocation z), weight 1. Direct:
 // all poses into the frame. E is a copy with a margin of zeros (padded.wgsl): positions beyond are clamped into the margin.
 override SUPPORT: i32 = 2;
+// Whether to add to what the output holds: no parameter, because software rasterisers run both sides of a branch.
+override ACCUMULATE: bool = false;
 
 struct Params {
     in_size: vec2i,        // of the copy
@@ -12,8 +14,8 @@ struct Params {
     out_first: i32,        // row of the binding at which the output begins
     first_base: u32,       // base of invocations with z = 0
     span: u32,             // bases that one invocation sums
-    accumulate: u32,       // 1: add to what the output holds
-    _pad: vec2u,
+    _pad0: u32,
+    _pad1: vec2u,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -65,7 +67,7 @@ fn source(abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
 }
 
 fn store(i: u32, value: vec3f) {
-    if params.accumulate == 1u {
+    if ACCUMULATE {
         out_r[i] += value.x;
         out_g[i] += value.y;
         out_b[i] += value.z;

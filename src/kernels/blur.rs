@@ -54,8 +54,7 @@ struct WarpParams {
     out_first: i32,
     first_base: u32,
     span: u32,
-    accumulate: u32,
-    _pad: [u32; 2],
+    _pad: [u32; 3],
 }
 
 #[repr(C)]
@@ -83,8 +82,8 @@ struct TapParams {
     in_plane: i32,
     first_group: u32,
     span: u32,
-    accumulate: u32,
     out_first: i32,
+    _pad: u32,
 }
 
 #[repr(C)]
@@ -114,10 +113,11 @@ pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
 /// The compiled kernels of K and Kᵀ.
 pub struct BlurKernels {
     padded: Kernel,
-    warp: Kernel,
+    /// Overwriting, adding.
+    warp: [Kernel; 2],
     warp_adjoint: Kernel,
     warp_adjoint_near: Kernel,
-    tap_sum: Kernel,
+    tap_sum: [Kernel; 2],
     support: usize,
 }
 
@@ -128,10 +128,10 @@ impl BlurKernels {
         let constants = [("SUPPORT", support as f64)];
         Self {
             padded: Kernel::new(gpu, "padded", PADDED, &[]),
-            warp: Kernel::new(gpu, "warp", WARP, &constants),
+            warp: [0.0, 1.0].map(|add| Kernel::new(gpu, "warp", WARP, &[constants[0], ("ACCUMULATE", add)])),
             warp_adjoint: Kernel::new(gpu, "warp_adjoint", WARP_ADJOINT, &constants),
             warp_adjoint_near: Kernel::new(gpu, "warp_adjoint_near", WARP_ADJOINT_NEAR, &constants),
-            tap_sum: Kernel::new(gpu, "tap_sum", TAP_SUM, &[]),
+            tap_sum: [0.0, 1.0].map(|add| Kernel::new(gpu, "tap_sum", TAP_SUM, &[("ACCUMULATE", add)])),
             support,
         }
     }
@@ -537,40 +537,38 @@ impl Blur {
                     out_first: 0,
                     first_base: first as u32,
                     span: 1,
-                    accumulate: 0,
-                    _pad: [0; 2],
+                    _pad: [0; 3],
                 };
-                let mut warp = |params: &WarpParams, out: [wgpu::BufferBinding; 3], depth: usize| {
+                let mut warp = |params: &WarpParams, out: [wgpu::BufferBinding; 3], depth: usize, add: bool| {
                     let table = self.base_table.as_entire_buffer_binding();
                     let [a, b, c] = copy.clone();
                     let [x, y, z] = out;
                     let groups = [(params.out_size[0] as u32).div_ceil(64), (params.out_size[1] as u32).div_ceil(8), depth as u32];
-                    steps.push(kernels.warp.step_parts(gpu, params, &[table, a, b, c, x, y, z], groups));
+                    steps.push(kernels.warp[usize::from(add)].step_parts(gpu, params, &[table, a, b, c, x, y, z], groups));
                 };
                 let Some(chunk) = chunk else {
                     params.out_size = [self.frame.0 as i32, (to - from) as i32];
                     params.out_origin = [0, from as i32];
                     params.out_first = out_first;
                     params.span = n as u32;
-                    params.accumulate = u32::from(first > 0);
-                    warp(&params, target.clone(), 1);
+                    warp(&params, target.clone(), 1, first > 0);
                     continue;
                 };
                 let planes = || scratch.planes.each_ref().map(|b| b.as_entire_buffer_binding());
-                warp(&params, planes(), n);
+                warp(&params, planes(), n, false);
                 let params = TapParams {
                     out_size: [self.frame.0 as i32, (to - from) as i32],
                     in_stride: width as i32,
                     in_plane: (width * height) as i32,
                     first_group: (first - chunk.first) as u32,
                     span: n as u32,
-                    accumulate: u32::from(first > 0),
                     out_first,
+                    _pad: 0,
                 };
                 let ([a, b, c], [x, y, z]) = (planes(), target.clone());
                 let parts = [chunk.forward.as_entire_buffer_binding(), a, b, c, x, y, z];
                 let groups = [self.frame.0.div_ceil(128) as u32, (to - from).div_ceil(8) as u32, 1];
-                steps.push(kernels.tap_sum.step_parts(gpu, &params, &parts, groups));
+                steps.push(kernels.tap_sum[usize::from(first > 0)].step_parts(gpu, &params, &parts, groups));
             }
         }
         steps
@@ -627,13 +625,13 @@ impl Blur {
                         in_plane: 0,
                         first_group: (first - chunk.first) as u32,
                         span: 1,
-                        accumulate: 0,
                         out_first: 0,
+                        _pad: 0,
                     };
                     let ([a, b, c], [x, y, z]) = (copy(), planes());
                     let parts = [chunk.adjoint.as_entire_buffer_binding(), a, b, c, x, y, z];
                     let groups = [width.div_ceil(128) as u32, height.div_ceil(8) as u32, n as u32];
-                    steps.push(kernels.tap_sum.step_parts(gpu, &params, &parts, groups));
+                    steps.push(kernels.tap_sum[0].step_parts(gpu, &params, &parts, groups));
                     planes()
                 } else {
                     params.in_size[0] = copy_width as i32;
