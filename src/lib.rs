@@ -8,11 +8,13 @@
 //! 3. [`triage`]: which frames are sharp.
 //! 4. [`psf`]: patches of each blurred frame and their local PSFs h against the sharp reference (eq. 11).
 //! 5. [`tsf`]: the transformation spread function h_T over poses Γ (eq. 2-6) from the PSFs, refined on the whole frame.
+//!    When no frame is sharp, [`blind`] finds the TSFs of all frames and the scene together instead (section III-B).
 //! 6. [`deblur`]: irradiance E that explains all frames, data term and total variation (eq. 9-10), by conjugate
 //!    gradients on the GPU; K and its exact adjoint Kᵀ are the [`kernels`].
 //! 7. [`pipeline`]: these stages in order, from [`exposure::Bracket`] to irradiance and report.
 
 pub mod baseline;
+pub mod blind;
 pub mod cli;
 pub mod colour;
 pub mod deblur;

@@ -19,6 +19,10 @@ use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 use std::time::Instant;
 
+mod blind;
+
+pub use blind::Blind;
+
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -40,6 +44,8 @@ pub struct Settings {
     pub patches: Vec<(usize, usize)>,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
+    /// What to do when no frame is sharp.
+    pub blind: Blind,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
@@ -56,6 +62,7 @@ impl Default for Settings {
             focal_px: None,
             patches: Vec::new(),
             noise: None,
+            blind: Blind::default(),
             deblur: deblur::Settings::default(),
         }
     }
@@ -124,6 +131,7 @@ struct Run<'a> {
     left_out: Vec<(String, String)>,
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
+    blind: Value,
 }
 
 /// Reconstructs the irradiance of `bracket`. `given`: TSFs to use instead of estimating them. `events` is called from
@@ -162,6 +170,7 @@ pub fn merge(
         left_out: Vec::new(),
         events,
         timings: Vec::new(),
+        blind: Value::Null,
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
     run.reconstruct(verdicts, excluded, given)
@@ -311,9 +320,30 @@ impl Run<'_> {
         let mut sharp: Vec<bool> =
             (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, |t| t.single().is_some())).collect();
         let all_known = used.iter().all(|&i| tsfs[i].is_some());
-        let blind = !sharp.contains(&true) && !all_known;
-        if blind {
+        // Where no frame shows the scene: what to start from instead.
+        let mut scene: Option<Rgb> = None;
+        let mut centre: Option<usize> = None;
+        let forced = self.settings.blind == Blind::Joint && given.is_none();
+        let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
+        let mut unexplained = merged_only;
+        if merged_only {
             self.warn("no frame is sharp: the frames are merged without deblurring".into())?;
+        } else if forced || (!all_known && !sharp.contains(&true)) {
+            match self.timed("all blurs", |run| run.joint(&used, 0.03, 0.60))? {
+                Some(found) => {
+                    scene = Some(found.start);
+                    centre = Some(found.reference);
+                    for (&i, tsf) in used.iter().zip(found.tsfs) {
+                        sharp[i] = false;
+                        tsfs[i] = Some(tsf);
+                    }
+                }
+                None => unexplained = true,
+            }
+        } else if !sharp.contains(&true) {
+            scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);
+        }
+        if unexplained {
             for &i in &used {
                 sharp[i] = true;
             }
@@ -321,11 +351,18 @@ impl Run<'_> {
         let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
-        let reference = self.settings.reference.or(found).unwrap_or(0);
-        if known.iter().all(|k| !k) {
+        let reference = self.settings.reference.or(centre).or(found).unwrap_or(0);
+        if scene.is_some() {
+            for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
+                *motion = tsf.as_ref().map_or(*motion, Tsf::centre);
+            }
+        } else if known.iter().all(|k| !k) {
             self.rebase(reference);
         }
         self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
+        if unexplained {
+            self.prefer_detail(|i| verdicts[i].detail);
+        }
         let mut details: Vec<Value> = vec![Value::Null; frames.len()];
 
         // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
@@ -342,7 +379,7 @@ impl Run<'_> {
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
         let initial = initial.map_planes(|p| p.padded(pad));
         let base = self.timed("sharp frames", |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.05, 0.10))?;
-        let mut latent = base.cropped();
+        let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
@@ -373,7 +410,10 @@ impl Run<'_> {
             }
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
             let pad = deblur::pad_for(&known, w, h, limit);
-            let from = solution.as_ref().unwrap_or(&base).with_pad(pad);
+            let from = match (&solution, &scene) {
+                (None, Some(scene)) => scene.map_planes(|p| p.padded(pad)),
+                (found, _) => found.as_ref().unwrap_or(&base).with_pad(pad),
+            };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
                 deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() }
@@ -585,7 +625,9 @@ impl Run<'_> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let mut irradiance = solution.cropped();
-        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, all, &self.motions);
+        // What a blurred frame clips, blur has spread: it bounds nothing.
+        let unblurred: Vec<usize> = all.iter().copied().filter(|&i| tsfs[i].as_ref().is_none_or(|t| t.single().is_some())).collect();
+        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, &unblurred, &self.motions);
         let scale = frames[reference].exposure_time as f32;
         let irradiance = irradiance.map_planes(|p| p.map(|v| v * scale));
         let entries: Vec<Value> = (0..frames.len())
@@ -604,6 +646,7 @@ impl Run<'_> {
                 })
             })
             .collect();
+        let blind = self.blind_report();
         let report = json!({
             "format": "unshaken-report",
             "version": 1,
@@ -613,6 +656,7 @@ impl Run<'_> {
             "reference": frames[reference].name,
             "scale": { "rule": "value = irradiance * exposure time of the reference frame", "factor_s": scale },
             "noise": self.noise,
+            "blind": blind,
             "frames": entries,
             "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,

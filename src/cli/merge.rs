@@ -10,7 +10,7 @@ use crate::io::exr::{self, Radiometry};
 use crate::io::output::{self, Output};
 use crate::layers;
 use crate::noise::NoiseModel;
-use crate::pipeline::{self, Event, Settings};
+use crate::pipeline::{self, Blind, Event, Settings};
 use crate::response::{Response, ResponseFile};
 use crate::tonemap::Operator;
 use crate::tsf::{Interpolation, Model, TsfFile};
@@ -314,6 +314,15 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         _ => Interpolation::Bilinear,
     };
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
+    settings.blind = match args.blind.as_deref() {
+        None | Some("auto") => Blind::Auto,
+        Some("joint") => Blind::Joint,
+        Some("off") => Blind::Off,
+        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint nor off"))),
+    };
+    if settings.blind == Blind::Joint && args.tsf.is_some() {
+        return Err(Usage("--blind joint estimates the TSFs that --tsf gives; leave one of them out".into()));
+    }
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
         return Err(Usage(format!("--sharp and --exclude both name {}; name it in one of them", name(*i))));

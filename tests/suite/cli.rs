@@ -133,6 +133,8 @@ fn wrong_options_are_usage_errors() {
         ),
         ("merge -o x.exr --exposures 1,2 --focal-px 0 a.png b.png", 2, &["--focal-px", "positive"]),
         ("merge -o x.exr --exposures 1,2 --patch 12 a.png b.png", 2, &["--patch", "120,80"]),
+        ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint nor off"]),
+        ("merge -o x.exr --exposures 1,2 --blind joint --tsf tsf.json a.png b.png", 2, &["--blind joint", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --alpha 1.5 a.png b.png", 2, &["--alpha", "from 0 to 1"]),
         ("merge -o x.exr --exposures 1,2 --noise 4000 a.png b.png", 2, &["--noise", "\"4000\"", "12000,6"]),
         ("merge -o x.exr --exposures 1,2 --noise 0,8 a.png b.png", 2, &["--noise", "full well"]),

@@ -12,6 +12,8 @@ mod adjoint;
 mod baseline;
 /// Many photographs: grouping, shards, resuming; configuration, voices, interruption.
 mod batch;
+/// Brackets without a sharp frame.
+mod blind;
 /// The program as a user runs it: outputs, messages, exit codes.
 mod cli;
 /// The demo's bracket and its before/after picture.

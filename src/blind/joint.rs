@@ -1,0 +1,319 @@
+//! The joint estimate: luminance and TSFs in turn, from coarse to fine.
+
+use super::luminance::{self, Effort, Frame, chi_squared, operators};
+use crate::image::Plane;
+use crate::merge::gradient_level;
+use crate::pose::{Pose, PoseGrid};
+use crate::tsf::{Tsf, WholeFrame};
+use glam::DMat3;
+use rayon::prelude::*;
+
+/// Where the estimate is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stage {
+    /// Pixels of the frame per pixel of the level that is worked on, per axis.
+    pub scale: usize,
+    /// Part of the whole that is done, 0..=1.
+    pub fraction: f32,
+}
+
+/// What was found.
+#[derive(Clone, Debug)]
+pub struct Joint {
+    /// One TSF per frame; the mean pose of the reference frame is the identity.
+    pub tsfs: Vec<Tsf>,
+    /// Latent luminance (irradiance) on the frame's grid plus `pad` on every side.
+    pub luminance: Plane,
+    /// Pad in pixels.
+    pub pad: usize,
+    /// Frame whose mean pose is the identity.
+    pub reference: usize,
+    /// Mean squared residual over noise variance of each frame on pixels that no part of the estimate has seen.
+    pub held_out: Vec<f64>,
+    /// The same for a scene solved from the frames as they are placed, unblurred: what a merge explains.
+    pub held_out_merge: Vec<f64>,
+}
+
+/// A way to begin.
+pub struct Start {
+    /// Frame whose TSF is the identity at the start, and whose mean pose is the identity at the end.
+    pub reference: usize,
+    /// Irradiance at the start.
+    pub luminance: Plane,
+}
+
+/// Side in pixels down to which the coarsest level shrinks the frame's longer side: there a blur is a few pixels long. Coarser, bilinear
+/// warps are no longer true to a blur of less than a pixel, and the TSFs widen to make up for it.
+const COARSEST: usize = 250;
+/// Rounds of luminance and TSFs at the coarsest level and at finer ones.
+const ROUNDS: (usize, usize) = (10, 3);
+/// Rounds after which the better start is chosen.
+const TRIAL: usize = 2;
+/// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
+const LAMBDA: f32 = 3.0;
+/// Smoothness at the start of the coarsest level and of a finer one, in units of λ.
+const SMOOTHNESS: (f32, f32) = (4.0, 2.0);
+/// Error of the operators at the first and last round of a level, as a part of the mean absolute gradient around a pixel.
+const MODEL_ERROR: (f32, f32) = (0.1, 0.04);
+/// The largest translation of the pose grid is the frame's longer side over this.
+const SEARCHED: usize = 20;
+/// Largest roll of the pose grid, degrees.
+const DEGREES: f64 = 2.0;
+/// Poses of a weight below this part of the largest are dropped.
+const FAINT: f64 = 0.02;
+/// One pixel of so many is held out.
+const HELD: usize = 29;
+
+/// `frame` at 1/`scale` of its size: means over squares, masked where any of their pixels is.
+pub fn shrink(frame: &Frame, scale: usize) -> Frame {
+    if scale == 1 {
+        return frame.clone();
+    }
+    let (w, h) = (frame.blurred.width / scale, frame.blurred.height / scale);
+    let n = (scale * scale) as f32;
+    let fold = |p: &Plane, x: usize, y: usize, start: f32, f: fn(f32, f32) -> f32| {
+        (0..scale * scale).fold(start, |s, k| f(s, p.at(x * scale + k % scale, y * scale + k / scale)))
+    };
+    let add = |a: f32, b: f32| a + b;
+    let wide = frame.blurred.width;
+    Frame {
+        blurred: Plane::from_fn(w, h, |x, y| fold(&frame.blurred, x, y, 0.0, add) / n),
+        variance: Plane::from_fn(w, h, |x, y| fold(&frame.variance, x, y, 0.0, add) / (n * n)),
+        mask: Plane::from_fn(w, h, |x, y| fold(&frame.mask, x, y, 1.0, f32::min)),
+        clipped: (0..w * h)
+            .map(|p| (0..scale * scale).all(|k| frame.clipped[(p / w * scale + k / scale) * wide + p % w * scale + k % scale]))
+            .collect(),
+    }
+}
+
+/// Bilinear sample.
+fn sample(plane: &Plane, x: f64, y: f64) -> f32 {
+    let (ix, iy) = (x.floor(), y.floor());
+    let (fx, fy) = ((x - ix) as f32, (y - iy) as f32);
+    let v = |i: isize, j: isize| plane.clamped(ix as isize + i, iy as isize + j);
+    (1.0 - fy) * ((1.0 - fx) * v(0, 0) + fx * v(1, 0)) + fy * ((1.0 - fx) * v(0, 1) + fx * v(1, 1))
+}
+
+/// Poses of a level `ratio` times coarser on the finer one, each spread over the pixels that its own pixel covers.
+fn spread(tsf: &Tsf, ratio: f64) -> Tsf {
+    let d = 0.25 * ratio;
+    let corners = [(-d, -d), (d, -d), (-d, d), (d, d)];
+    let finer = |p: &Pose, (x, y): (f64, f64)| Pose { t_x: p.t_x * ratio + x, t_y: p.t_y * ratio + y, weight: 0.25 * p.weight, ..*p };
+    Tsf { focal_px: tsf.focal_px * ratio, poses: tsf.poses.iter().flat_map(|p| corners.map(|c| finer(p, c))).collect(), base: tsf.base }
+}
+
+/// The poses of at least [`FAINT`] times the largest weight.
+fn without_faint(tsf: &Tsf) -> Option<Tsf> {
+    let most = tsf.poses.iter().map(|p| p.weight).fold(0.0, f64::max);
+    Tsf::new(tsf.focal_px, tsf.poses.iter().copied().filter(|p| p.weight >= FAINT * most).collect()).ok()
+}
+
+/// Γ ∘ M⁻¹ for all poses, M the mean pose of the frame `reference`: the TSFs of the scene warped by M, which is returned. Roll and
+/// translation only.
+pub fn fix_warp(tsfs: &mut [Tsf], reference: usize) -> Pose {
+    let m = tsfs[reference].mean();
+    for p in tsfs.iter_mut().flat_map(|t| &mut t.poses) {
+        let theta = p.theta_z_deg - m.theta_z_deg;
+        let (s, c) = theta.to_radians().sin_cos();
+        // T(t) R(θ) R(-θm) T(-m) = T(t - R(θ-θm) m) R(θ-θm)
+        *p = Pose { t_x: p.t_x - (c * m.t_x - s * m.t_y), t_y: p.t_y - (s * m.t_x + c * m.t_y), theta_z_deg: theta, ..*p };
+    }
+    m
+}
+
+/// `latent` warped by the planar pose `m` about its centre.
+fn warp(latent: &Plane, m: &Pose) -> Plane {
+    let (cx, cy) = ((latent.width as f64 - 1.0) / 2.0, (latent.height as f64 - 1.0) / 2.0);
+    let (s, c) = m.theta_z_deg.to_radians().sin_cos();
+    Plane::from_fn(latent.width, latent.height, |x, y| {
+        let (u, v) = (x as f64 - cx - m.t_x, y as f64 - cy - m.t_y);
+        sample(latent, c * u + s * v + cx, -s * u + c * v + cy)
+    })
+}
+
+/// Pixels farther than `radius` from those of which no frame has a measurement: nearer, what is clipped everywhere adds an unknown
+/// amount of light.
+fn known(frames: &[Frame], radius: usize) -> Vec<bool> {
+    let (w, h) = frames[0].blurred.size();
+    let lost = |x: usize, y: usize| frames.iter().all(|f| f.mask.at(x, y) == 0.0);
+    let near = |v: usize, n: usize| v.saturating_sub(radius)..=(v + radius).min(n - 1);
+    let lost: Vec<bool> = (0..w * h).map(|p| lost(p % w, p / w)).collect();
+    let rows: Vec<bool> = (0..w * h).map(|p| near(p % w, w).any(|x| lost[p / w * w + x])).collect();
+    (0..w * h).map(|p| !near(p / w, h).any(|y| rows[y * w + p % w])).collect()
+}
+
+/// One level of the pyramid.
+struct Level {
+    scale: usize,
+    frames: Vec<Frame>,
+    size: (usize, usize),
+    pad: usize,
+    grid: PoseGrid,
+    /// Pixels that count for TSFs and for the judgement.
+    known: Vec<bool>,
+    held: Vec<bool>,
+}
+
+/// Luminance and TSFs on a level.
+#[derive(Clone)]
+struct State {
+    reference: usize,
+    latent: Plane,
+    tsfs: Vec<Tsf>,
+}
+
+impl Level {
+    fn new(frames: &[Frame], scale: usize) -> Self {
+        let longer = frames[0].blurred.width.max(frames[0].blurred.height);
+        let frames: Vec<Frame> = frames.iter().map(|f| shrink(f, scale)).collect();
+        let size = frames[0].blurred.size();
+        let radius = (longer / SEARCHED).max(8).div_ceil(scale) + 1;
+        let grid = PoseGrid::new(size.0, size.1, radius, DEGREES, 1.0);
+        let known = known(&frames, 10 / scale + 1);
+        // A fixed scatter over rows and columns.
+        let held = (0..size.0 * size.1).map(|p| (p % size.0 * 12 + p / size.0 * 5).is_multiple_of(HELD)).collect();
+        Self { scale, pad: radius + 6, frames, size, grid, known, held }
+    }
+
+    /// The start explains its frame; the other TSFs follow from it.
+    fn begin(&self, start: &Start) -> State {
+        let whole = start.luminance.map(|_| 1.0);
+        let start_frame =
+            Frame { blurred: start.luminance.clone(), variance: whole.clone(), clipped: vec![false; whole.data.len()], mask: whole };
+        let latent = shrink(&start_frame, self.scale).blurred.padded(self.pad);
+        let mut tsfs: Vec<Tsf> =
+            self.frames.par_iter().map(|f| self.fit(f, &latent, None, MODEL_ERROR.0).unwrap_or_else(Tsf::identity)).collect();
+        tsfs[start.reference] = Tsf { focal_px: tsfs[start.reference].focal_px, ..Tsf::identity() };
+        let mut state = State { reference: start.reference, latent, tsfs };
+        self.solve(&mut state, SMOOTHNESS.0, MODEL_ERROR.0, 4);
+        state
+    }
+
+    fn solve(&self, state: &mut State, smoothness: f32, model_error: f32, outer: usize) {
+        let operators = operators(&state.tsfs, self.size, self.pad);
+        let effort = Effort { lambda: LAMBDA * smoothness, outer, inner: 12, model_error };
+        state.latent = luminance::solve(&self.frames, &operators, &state.latent, &self.held, &effort);
+    }
+
+    /// One round: luminance, then all TSFs, then the free warp.
+    fn round(&self, state: &mut State, smoothness: f32, model_error: f32) {
+        self.solve(state, smoothness, model_error, 2);
+        let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, &state.latent, Some(t), model_error));
+        let fits: Vec<Option<Tsf>> = fits.collect();
+        for (tsf, fit) in state.tsfs.iter_mut().zip(fits) {
+            if let Some(fit) = fit {
+                *tsf = fit;
+            }
+        }
+        let m = fix_warp(&mut state.tsfs, state.reference);
+        state.latent = warp(&state.latent, &m);
+    }
+
+    fn fit(&self, frame: &Frame, latent: &Plane, start: Option<&Tsf>, model_error: f32) -> Option<Tsf> {
+        let local = gradient_level(&frame.blurred, 4);
+        let weight = |p: usize| {
+            let m = if self.known[p] && !self.held[p] { frame.mask.data[p] } else { 0.0 };
+            m * m / (frame.variance.data[p] + (model_error * local.data[p]).powi(2))
+        };
+        let weight = Plane { data: (0..local.data.len()).map(weight).collect(), ..local };
+        let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
+        // Faint poses are the fit's answer to noise and to what the luminance still lacks; unchecked, they widen the TSF round by round.
+        let rough = without_faint(&whole.fit_grid(&self.grid, start)?)?;
+        without_faint(&whole.refine(&rough))
+    }
+
+    /// Mean squared residual over variance of each frame on the held-out pixels.
+    fn judge(&self, state: &State) -> Vec<f64> {
+        let chosen: Vec<bool> = self.held.iter().zip(&self.known).map(|(h, k)| *h && *k).collect();
+        let operators = operators(&state.tsfs, self.size, self.pad);
+        self.frames.iter().zip(&operators).map(|(f, o)| chi_squared(f, o, &state.latent, &chosen)).collect()
+    }
+
+    /// `state` of a level at `scale`.
+    fn refine(&self, state: State, from: &Level) -> State {
+        let ratio = (from.scale / self.scale) as f64;
+        let at = |v: usize| (v as f64 - self.pad as f64 + 0.5) / ratio - 0.5 + from.pad as f64;
+        let (w, h) = (self.size.0 + 2 * self.pad, self.size.1 + 2 * self.pad);
+        State {
+            reference: state.reference,
+            latent: Plane::from_fn(w, h, |x, y| sample(&state.latent, at(x), at(y))),
+            tsfs: state.tsfs.iter().map(|t| spread(t, ratio)).collect(),
+        }
+    }
+}
+
+/// Sum of the logarithms: no frame buys its fit with another's.
+fn loss(chi: &[f64]) -> f64 {
+    chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).sum()
+}
+
+/// Value at part `t` of the way from `range.0` to `range.1`, geometrically.
+fn between(range: (f32, f32), t: f32) -> f32 {
+    range.0 * (range.1 / range.0).powf(t)
+}
+
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with:
+/// a merge, unblurred, and where each frame lies. `progress` returning `false` ends the work: `None`, as for no start.
+pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
+    let longer = frames[0].blurred.width.max(frames[0].blurred.height);
+    let mut scale = 1;
+    while longer / scale > COARSEST {
+        scale *= 2;
+    }
+    let mut total = 0.0;
+    let mut s = scale;
+    while s >= 1 {
+        let rounds = if s == scale { ROUNDS.0 + TRIAL * (starts.len() - 1) } else { ROUNDS.1 };
+        total += rounds as f32 / (s * s) as f32;
+        s /= 2;
+    }
+    let mut done = 0.0;
+    let mut advance = |scale: usize| {
+        done += 1.0 / (scale * scale) as f32;
+        progress(Stage { scale, fraction: done / total })
+    };
+
+    let mut level = Level::new(frames, scale);
+    let mut best: Option<(f64, State)> = None;
+    for start in starts {
+        let mut state = level.begin(start);
+        for _ in 0..TRIAL {
+            level.round(&mut state, SMOOTHNESS.0, MODEL_ERROR.0);
+            if !advance(scale) {
+                return None;
+            }
+        }
+        let value = loss(&level.judge(&state));
+        if best.as_ref().is_none_or(|b| value < b.0) {
+            best = Some((value, state));
+        }
+    }
+    let (_, mut state) = best?;
+    for k in TRIAL..ROUNDS.0 {
+        let t = (k + 1 - TRIAL) as f32 / (ROUNDS.0 - TRIAL) as f32;
+        level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t));
+        if !advance(scale) {
+            return None;
+        }
+    }
+    while scale > 1 {
+        scale /= 2;
+        let finer = Level::new(frames, scale);
+        state = finer.refine(state, &level);
+        level = finer;
+        for k in 0..ROUNDS.1 {
+            let t = k as f32 / (ROUNDS.1 - 1) as f32;
+            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t));
+            if !advance(scale) {
+                return None;
+            }
+        }
+    }
+    level.solve(&mut state, 1.0, MODEL_ERROR.1, 3);
+    let held_out = level.judge(&state);
+    // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
+    let mut still = State { reference: state.reference, latent: merged.0.padded(level.pad), tsfs: merged.1.to_vec() };
+    level.solve(&mut still, 1.0, MODEL_ERROR.1, 3);
+    let held_out_merge = level.judge(&still);
+    Some(Joint { tsfs: state.tsfs, luminance: state.latent, pad: level.pad, reference: state.reference, held_out, held_out_merge })
+}

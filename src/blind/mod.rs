@@ -1,0 +1,17 @@
+//! Brackets without a sharp frame (section III-B): irradiance and the TSFs of all frames together.
+//!
+//! Coarse to fine over the whole bracket, on luminance: with the TSFs held, the latent luminance that explains all frames
+//! (a solver on the CPU); with the luminance held, each frame's TSF from the whole frame ([`crate::tsf::WholeFrame`]). It starts from the least
+//! blurred frame, the smoothness is strong at first and falls.
+//!
+//! Any common warp of all TSFs can be made good by the opposite warp of the scene. It is fixed so that the mean pose of the reference
+//! frame is the identity.
+
+mod joint;
+mod luminance;
+mod operator;
+
+pub use joint::fix_warp;
+pub use joint::{Joint, Stage, Start, estimate};
+pub use luminance::{Frame, luminance_of};
+pub use operator::Operator;

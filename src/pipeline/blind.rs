@@ -1,0 +1,163 @@
+//! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
+
+use super::{Event, Run};
+use crate::blind::{self, Frame, Start};
+use crate::deblur;
+use crate::error::{Error, Result};
+use crate::image::{Plane, Rgb};
+use crate::mask;
+use crate::merge;
+use crate::tsf::Tsf;
+use glam::DMat3;
+use serde_json::{Value, json};
+
+/// What is done when no frame is sharp.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Blind {
+    /// [`Blind::Joint`] when no frame is sharp.
+    #[default]
+    Auto,
+    /// Irradiance and the TSFs of all frames together, whatever the triage says of the frames.
+    Joint,
+    /// The frames are merged without deblurring when none is sharp.
+    Off,
+}
+
+/// Irradiance to start from and one TSF for each of the frames used.
+pub(super) struct Found {
+    pub start: Rgb,
+    pub tsfs: Vec<Tsf>,
+    pub reference: usize,
+}
+
+/// Held-out χ² of the joint estimate over that of the merge below which it is believed.
+const EXPLAINED: f64 = 0.25;
+/// The same where the joint estimate leaves little more than noise, and how much that is: a slight blur is worth undoing as well.
+const SLIGHTLY: (f64, f64) = (0.8, 4.0);
+/// Weight of the faintest frame's mask in the merge that is returned instead.
+const LEAST_DETAIL: f64 = 0.1;
+
+/// exp of the mean logarithm: no frame buys its fit with another's.
+fn geometric_mean(chi: &[f64]) -> f64 {
+    let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
+    if logs.is_empty() { f64::INFINITY } else { (logs.iter().sum::<f64>() / logs.len() as f64).exp() }
+}
+
+impl Run<'_> {
+    fn luminances(&self, used: &[usize]) -> (Vec<Frame>, Rgb) {
+        let frames = self.bracket.frames();
+        let masks = mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions);
+        let (aligned, seen) = self.aligned(used, &masks);
+        let merged = merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used);
+        let frame = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], frames[i].exposure_time);
+        (used.iter().map(frame).collect(), merged)
+    }
+
+    /// Exposures and masks of the frames `used` as registration places them.
+    fn aligned(&self, used: &[usize], masks: &[Plane]) -> (Vec<Rgb>, Vec<Plane>) {
+        let seen = (0..masks.len()).map(|i| {
+            if used.contains(&i) && self.motions[i] != DMat3::IDENTITY {
+                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i])
+            } else {
+                (self.exposures[i].clone(), masks[i].clone())
+            }
+        });
+        seen.unzip()
+    }
+
+    /// `luminance` in the colours of `merged`: those of a blurred merge, but they change less across an edge than the luminance does.
+    fn coloured(merged: &Rgb, luminance: &Plane) -> Rgb {
+        let mean = merged.mean();
+        merged.map_planes(|p| {
+            let data =
+                p.data.iter().zip(mean.data.iter().zip(&luminance.data)).map(|(c, (m, l))| c * l / m.max(f32::MIN_POSITIVE)).collect();
+            Plane { width: p.width, height: p.height, data }
+        })
+    }
+
+    /// Irradiance to start from where the TSFs of all of the frames `used` are known: no frame shows the scene, and the colour
+    /// solver's iterations are dear.
+    pub(super) fn start_from_tsfs(&mut self, used: &[usize], tsfs: &[Option<Tsf>]) -> Result<Rgb> {
+        let (frames, merged) = self.luminances(used);
+        let (w, h) = self.bracket.size();
+        let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().unwrap_or_else(Tsf::identity)).collect();
+        let pad = deblur::pad_for(&known.iter().collect::<Vec<_>>(), w, h, (super::LARGEST_PAD * w.max(h) as f64) as usize);
+        let luminance = blind::luminance_of(&frames, &known, &merged.mean(), pad);
+        Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h)))
+    }
+
+    /// The joint estimate over the frames `used`; `None` when a merge explains them as well. Progress runs from `from` to `to`.
+    pub(super) fn joint(&mut self, used: &[usize], from: f32, to: f32) -> Result<Option<Found>> {
+        let (frames, merged) = self.luminances(used);
+        let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
+        // The shortest frame is nearly always the least blurred.
+        let mut order: Vec<usize> = (0..used.len()).collect();
+        order.sort_by(|&a, &b| self.bracket.frames()[used[a]].exposure_time.total_cmp(&self.bracket.frames()[used[b]].exposure_time));
+        if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
+            order = vec![r];
+        }
+        let starts: Vec<Start> = order
+            .iter()
+            .take(2)
+            .map(|&k| {
+                let alone = merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]);
+                Start { reference: k, luminance: alone.mean() }
+            })
+            .collect();
+        let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
+        let events = &mut self.events;
+        let found = blind::estimate(&frames, &starts, (&merged.mean(), &still), &mut |s| {
+            let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
+            events(Event::Progress {
+                stage: format!("no frame is sharp: estimating all blurs{size}"),
+                fraction: from + (to - from) * s.fraction,
+            })
+        })
+        .ok_or(Error::Cancelled)?;
+        let (joint, alone) = (geometric_mean(&found.held_out), geometric_mean(&found.held_out_merge));
+        let believed = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
+        self.blind = json!({
+            "method": "joint",
+            "reference": names[found.reference],
+            "believed": believed,
+            "held_out_chi_squared": found.held_out,
+            "held_out_chi_squared_of_merge": found.held_out_merge,
+        });
+        if !believed {
+            self.warn(format!(
+                "no frame is sharp, and camera shake explains the frames no better than a merge (residuals {joint:.1} against {alone:.1} \
+                 times the noise): they are merged without deblurring, the least blurred weighted most"
+            ))?;
+            return Ok(None);
+        }
+        let (w, h) = self.bracket.size();
+        let luminance = found.luminance.crop(found.pad, found.pad, w, h);
+        // The colours as the TSFs place the frames.
+        for (&i, tsf) in used.iter().zip(&found.tsfs) {
+            self.motions[i] = tsf.centre();
+        }
+        let merged = self.luminances(used).1;
+        Ok(Some(Found { start: Self::coloured(&merged, &luminance), tsfs: found.tsfs, reference: used[found.reference] }))
+    }
+
+    /// Masks by which the frame `i` alone counts.
+    fn own_masks(&self, i: usize) -> Vec<Plane> {
+        let frames = self.bracket.frames();
+        let mut alone = vec![false; frames.len()];
+        alone[i] = true;
+        mask::masks(frames, &alone, self.settings.alpha as f32, &self.motions)
+    }
+
+    /// Lessens the masks of the frames with less fine structure, for a merge of blurred frames. `detail`: 0..=1 per frame.
+    pub(super) fn prefer_detail(&mut self, detail: impl Fn(usize) -> f64) {
+        for (i, mask) in self.masks.iter_mut().enumerate() {
+            let share = detail(i).clamp(LEAST_DETAIL, 1.0) as f32;
+            mask.data.iter_mut().for_each(|m| *m *= share);
+        }
+    }
+
+    /// What the report says about a bracket without a sharp frame; null where there was one.
+    pub(super) fn blind_report(&mut self) -> Value {
+        std::mem::take(&mut self.blind)
+    }
+}

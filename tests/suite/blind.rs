@@ -1,0 +1,170 @@
+//! Brackets without a sharp frame, on scenes and shakes that are planted.
+
+use crate::oracle::blur as oracle;
+use crate::support::{assert_close, f64s, noise, uniform};
+use unshaken::blind::{self, Frame, Operator, Start, fix_warp};
+use unshaken::image::Plane;
+use unshaken::pose::Pose;
+use unshaken::tsf::{Interpolation, TapSet, Tsf};
+
+/// A path of `n` poses from `from` to `to` (x, y, degrees), bent in the middle by `bend` pixels.
+fn path(n: usize, from: [f64; 3], to: [f64; 3], bend: f64) -> Tsf {
+    let poses = (0..n)
+        .map(|i| {
+            let t = i as f64 / (n - 1) as f64;
+            let at = |k: usize| from[k] + (to[k] - from[k]) * t;
+            Pose::planar(at(0), at(1) + bend * (4.0 * t * (1.0 - t) - 0.66), at(2), 1.0)
+        })
+        .collect();
+    Tsf::new(150.0, poses).unwrap()
+}
+
+#[test]
+fn the_blur_of_a_plane_and_its_adjoint_are_the_matrix() {
+    let (size, pad) = ((11, 8), 4);
+    let yaw =
+        Tsf::new(40.0, vec![Pose { theta_y_deg: 2.0, ..Pose::planar(0.3, -0.8, 1.0, 0.5) }, Pose::planar(-1.2, 0.6, -2.0, 0.5)]).unwrap();
+    for tsf in [path(7, [-2.0, 1.0, -3.0], [1.5, -1.2, 4.0], 0.7), yaw] {
+        let taps = TapSet::shifted(&tsf, size.0, size.1, Interpolation::Bilinear);
+        let k = oracle::of_taps(&taps, Interpolation::Bilinear, size, pad);
+        let operator = Operator::new(&tsf, size.0, size.1, pad);
+        let (e, r) = (uniform(1, k.columns, 0.1, 2.0), noise(2, size.0 * size.1));
+        // Where K looks beyond the latent grid the matrix sees part of a pixel, the operator none of it; both are masked.
+        let inside = operator.inside();
+        assert!(inside.iter().filter(|i| **i).count() > 30, "most of the frame is inside");
+        let masked: Vec<f32> = r.iter().zip(&inside).map(|(v, i)| if *i { *v } else { 0.0 }).collect();
+        let expected = k.apply(&f64s(&e));
+        // f32 sums of some dozens of weights of at most 1.
+        assert_close("K E", &operator.forward(&e), &expected, |q| if inside[q] { 3e-6 } else { f64::INFINITY });
+        assert_close("K^T r", &operator.adjoint(&masked), &k.transposed(&f64s(&masked)), |_| 3e-6);
+    }
+}
+
+#[test]
+fn fixing_the_warp_moves_every_point_as_before() {
+    let mut tsfs = vec![path(5, [1.0, 2.0, 0.3], [3.0, -1.0, 0.9], 0.5), path(4, [-3.0, 0.0, -0.5], [2.0, 5.0, 0.2], 0.0)];
+    let before = tsfs.clone();
+    let m = fix_warp(&mut tsfs, 0);
+    let mean = tsfs[0].mean();
+    assert!(mean.theta_z_deg.abs() < 1e-12 && mean.t_x.hypot(mean.t_y) < 0.02, "the reference rests: {mean:?}");
+    for (new, old) in tsfs.iter().zip(&before) {
+        for (p, q) in new.poses.iter().zip(&old.poses) {
+            let x = glam::DVec2::new(70.0, -40.0);
+            let moved = p.apply(150.0, m.apply(150.0, x));
+            assert!((moved - q.apply(150.0, x)).length() < 1e-9, "{moved} is not {}", q.apply(150.0, x));
+        }
+    }
+}
+
+/// Tiles of random brightness with a little texture: edges in all places, two decades.
+fn tiles(width: usize, height: usize) -> Plane {
+    let levels = uniform(5, 4096, -1.5, 1.5);
+    let grain = noise(6, width * height);
+    Plane::from_fn(width, height, |x, y| {
+        let (u, v) = ((x + y / 3) / 9, (y + 400 - x / 5) / 7);
+        (levels[(u * 61 + v * 17) % 4096] + 0.03 * grain[y * width + x]).exp()
+    })
+}
+
+const SIZE: (usize, usize) = (72, 60);
+const PAD: usize = 20;
+
+/// Three frames of `tiles` under `tsfs`, noise of half a per cent.
+fn frames(latent: &Plane, tsfs: &[Tsf]) -> Vec<Frame> {
+    let frame = |(k, tsf): (usize, &Tsf)| {
+        let clean = Operator::new(tsf, SIZE.0, SIZE.1, PAD).forward(&latent.data);
+        // The sum of twelve uniform numbers, less their mean, is close to a normal one.
+        let draws = uniform(50 + k as u64, 12 * clean.len(), 0.0, 1.0);
+        let noisy = clean.iter().enumerate().map(|(p, v)| v + 0.005 * (draws[12 * p..12 * p + 12].iter().sum::<f32>() - 6.0));
+        let of = |value: f32| Plane::filled(SIZE.0, SIZE.1, value);
+        let blurred = Plane { data: noisy.collect(), ..of(0.0) };
+        Frame { blurred, variance: of(0.005 * 0.005), mask: of(1.0), clipped: vec![false; SIZE.0 * SIZE.1] }
+    };
+    tsfs.iter().enumerate().map(frame).collect()
+}
+
+/// Root mean square difference of logarithms away from the border.
+fn difference(a: &Plane, b: &Plane) -> f64 {
+    let inner: Vec<usize> = (12..SIZE.1 - 12).flat_map(|y| (12..SIZE.0 - 12).map(move |x| y * SIZE.0 + x)).collect();
+    (inner.iter().map(|&p| f64::from((a.data[p] / b.data[p]).ln()).powi(2)).sum::<f64>() / inner.len() as f64).sqrt()
+}
+
+fn mean(frames: &[Frame]) -> Plane {
+    let n = frames.len() as f32;
+    Plane {
+        data: (0..SIZE.0 * SIZE.1).map(|p| frames.iter().map(|f| f.blurred.data[p]).sum::<f32>() / n).collect(),
+        ..frames[0].blurred.clone()
+    }
+}
+
+fn still() -> Vec<Tsf> {
+    vec![Tsf::identity(); 3]
+}
+
+fn shakes() -> Vec<Tsf> {
+    let mut tsfs = vec![
+        path(9, [-1.5, 0.5, -0.3], [1.5, -0.5, 0.3], 0.8),
+        path(11, [2.0, -2.5, 0.4], [-1.0, 2.0, -0.2], 1.0),
+        path(13, [-4.0, -1.0, 0.2], [3.5, 2.0, 0.8], -2.0),
+    ];
+    fix_warp(&mut tsfs, 0);
+    tsfs
+}
+
+#[test]
+fn known_tsfs_give_the_scene() {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let truth = latent.crop(PAD, PAD, SIZE.0, SIZE.1);
+    let tsfs = shakes();
+    let frames = frames(&latent, &tsfs);
+    let merged = mean(&frames);
+    let found = blind::luminance_of(&frames, &tsfs, &merged, 14).crop(14, 14, SIZE.0, SIZE.1);
+    let (start, end) = (difference(&merged, &truth), difference(&found, &truth));
+    assert!(end < 0.2 * start, "the blurred merge is {start:.3} off, the solution {end:.3}");
+}
+
+#[test]
+fn scene_and_shakes_are_found_together() {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let truth = latent.crop(PAD, PAD, SIZE.0, SIZE.1);
+    let frames = frames(&latent, &shakes());
+    let merged = mean(&frames);
+    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+    let mut last = 0.0;
+    let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |s| {
+        assert!(s.fraction >= last && s.fraction <= 1.001, "progress goes on: {last} to {}", s.fraction);
+        last = s.fraction;
+        true
+    })
+    .unwrap();
+    let luminance = found.luminance.crop(found.pad, found.pad, SIZE.0, SIZE.1);
+    let (single, end) = (difference(&frames[0].blurred, &truth), difference(&luminance, &truth));
+    assert!(end < 0.6 * single, "the least blurred frame is {single:.3} off, the estimate {end:.3}");
+    assert!(found.tsfs[0].mean().t_x.hypot(found.tsfs[0].mean().t_y) < 0.05, "the reference frame rests");
+    for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
+        assert!(*joint < 0.25 * alone, "held-out residuals {joint:.1}, those of a merge {alone:.1}");
+    }
+}
+
+#[test]
+fn a_still_bracket_is_explained_as_well_by_a_merge() {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
+    let merged = mean(&frames);
+    let found = blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], (&merged, &still()), &mut |_| true).unwrap();
+    for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
+        assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
+    }
+}
+
+#[test]
+fn the_joint_estimate_can_be_cancelled() {
+    let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
+    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+    let mut calls = 0;
+    let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| {
+        calls += 1;
+        calls < 2
+    });
+    assert!(found.is_none() && calls == 2);
+}
