@@ -327,7 +327,7 @@ impl Run<'_> {
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
-            self.warn("no frame is sharp: the frames are merged without deblurring".into())?;
+            self.warn("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || (!all_known && !sharp.contains(&true)) {
             match self.timed("all blurs", |run| run.joint(&used, 0.03, 0.60))? {
                 Some(found) => {

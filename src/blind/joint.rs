@@ -218,7 +218,7 @@ impl Level {
         let weight = Plane { data: (0..local.data.len()).map(weight).collect(), ..local };
         let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
         // Faint poses are the fit's answer to noise and to what the luminance still lacks; unchecked, they widen the TSF round by round.
-        let rough = without_faint(&whole.fit_grid(&self.grid, start)?)?;
+        let rough = whole.fit_grid(&self.grid, start)?;
         without_faint(&whole.refine(&rough))
     }
 

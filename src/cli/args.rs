@@ -109,7 +109,7 @@ pub(super) struct MergeArgs {
     /// Interpolation of the warps
     #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
     pub interpolation: String,
-    /// When no frame is sharp: auto (all blurs and the scene together), joint (so even if a frame passes for sharp), off (merge only) [default: auto]
+    /// When no frame is sharp: auto (all blurs and the scene together), joint (so even if a frame passes for sharp), off (merge only) [default: off]
     #[arg(long, value_name = "auto|joint|off")]
     pub blind: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)

@@ -315,7 +315,8 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     };
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
     settings.blind = match args.blind.as_deref() {
-        None | Some("auto") => Blind::Auto,
+        None => Blind::default(),
+        Some("auto") => Blind::Auto,
         Some("joint") => Blind::Joint,
         Some("off") => Blind::Off,
         Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint nor off"))),

@@ -328,24 +328,25 @@ fn correlations(reference: &Tone, seen: &Tone) -> Vec<f64> {
         }
     };
     let (a, b) = (detail(&reference.value), detail(&seen.value));
-    let mut sums = vec![[0.0f64; 6]; TILES.0 * TILES.1];
+    let mut sums = vec![[0.0f64; 7]; TILES.0 * TILES.1];
     for y in 0..h {
         for x in 0..w {
             let i = y * w + x;
             let k = f64::from(weight.data[i]);
             if k > 0.0 {
                 let (u, v) = (f64::from(a.data[i]), f64::from(b.data[i]));
-                let noise = f64::from(reference.variance.data[i] + seen.variance.data[i]);
+                let noise = [reference, seen].map(|t| k * f64::from(t.variance.data[i]));
                 let s = &mut sums[(y * TILES.1 / h) * TILES.0 + x * TILES.0 / w];
-                s.iter_mut().zip([k * u * v, k * u * u, k * v * v, k, k * noise, 1.0]).for_each(|(s, v)| *s += v);
+                s.iter_mut().zip([k * u * v, k * u * u, k * v * v, k, noise[0], 1.0, noise[1]]).for_each(|(s, v)| *s += v);
             }
         }
     }
     let pixels = (n / (TILES.0 * TILES.1)) as f64;
     sums.iter()
         .map(|s| {
-            // Half of the tile must be seen, and the structure of both be more than noise.
-            if s[5] > 0.4 * pixels && s[1] > 2.0 * s[3] * 1e-4 && s[1] + s[2] > s[4] {
+            // Half of the tile must be seen, and the structure of each be more than its noise: a part of which a short frame shows but
+            // noise says nothing of its place.
+            if s[5] > 0.4 * pixels && s[1] > 2.0 * s[3] * 1e-4 && s[1] > 2.0 * s[4] && s[2] > 2.0 * s[6] {
                 s[0] / (s[1] * s[2]).sqrt().max(1e-30)
             } else {
                 f64::NAN

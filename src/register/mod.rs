@@ -117,7 +117,7 @@ const LEAST_TILES: usize = 5;
 /// Share of the parts that agree with a wrong motion by chance.
 const CHANCE: f64 = 0.12;
 /// Share of the pixels that noise must explain for a frame without structure to stay where it is, and how many there must be.
-const SMOOTH: f64 = 0.97;
+const SMOOTH: f64 = 0.9;
 const SMOOTH_PIXELS: usize = 200;
 /// Most that parts may be left displaced, as a part of the frame's longer side.
 const LARGEST_RESIDUE: f64 = 0.004;
@@ -297,10 +297,14 @@ impl<'a> Registrar<'a> {
                     "has too little structure in common with the other frames to be registered (--no-align takes it as it lies)".into();
             }
         } else if agreement < AGREEMENT || !self.plausible(&motion) {
-            reason = format!(
-                "shows something else, or moved otherwise than as a whole: {:.0} % of its parts fit the other frames",
-                100.0 * agreement
-            );
+            if smooth() {
+                (model, motion) = (Model::Identity, DMat3::IDENTITY);
+            } else {
+                reason = format!(
+                    "shows something else, or moved otherwise than as a whole: {:.0} % of its parts fit the other frames",
+                    100.0 * agreement
+                );
+            }
         } else if sharp && residue > limit {
             reason = format!("does not move as a whole: its parts are {residue:.1} px from where they should be");
         }

@@ -421,7 +421,7 @@ fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
     let dir = tempdir().unwrap();
     // Bright, or the shortest frame's blur is lost in its noise.
     tiny(dir.path(), [14.0; 3], 1.5);
-    let (_, _, report, said) = merge_tiny(dir.path(), "blind", &[]);
+    let (_, _, report, said) = merge_tiny(dir.path(), "blind", &["--blind", "off"]);
     assert!(said.lines().any(|l| l.starts_with("warning:") && l.contains("no frame is sharp")), "{said}");
     assert_eq!(column(&report, "used"), [true; 3]);
     assert!(column(&report, "triage").iter().all(|t| t["sharp"] == false), "{:?}", column(&report, "triage"));

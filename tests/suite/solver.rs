@@ -319,7 +319,7 @@ fn a_bracket_of_one_shaken_frame_is_solved() {
 
 #[test]
 fn the_pad_holds_what_every_pose_sees() {
-    let poses = vec![Pose::planar(7.3, -2.0, 1.5, 0.5), Pose { theta_y_deg: 0.6, ..Pose::planar(-3.0, 4.2, 0.0, 0.5) }];
+    let poses = vec![Pose::planar(7.3, -2.0, 1.5, 0.5), Pose { theta_y_deg: 0.6, ..Pose::planar(-9.0, 2.2, -1.0, 0.5) }];
     let tsf = Tsf::new(300.0, poses).expect("valid");
     let (w, h) = (120, 80);
     let pad = pad_for(&[&tsf, &Tsf::identity()], w, h, 1000);
