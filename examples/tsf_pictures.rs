@@ -104,7 +104,7 @@ fn psfs(patches: &serde_json::Value, truth: &Tsf, found: &Tsf, size: (usize, usi
         let values = p["psf"]["values"].as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect();
         list.push((centre, n("confidence"), p["psf"]["radius"].as_i64().unwrap_or(0) as isize, values));
     }
-    list.sort_by(|a, b| (a.0.y as i64 / 96, a.0.x as i64).cmp(&(b.0.y as i64 / 96, b.0.x as i64)));
+    list.sort_by_key(|a| (a.0.y as i64 / 96, a.0.x as i64));
     let columns = 3;
     let cell = (3 * (side + gap) + 2 * gap, side + gap + 20);
     let rows = list.len().div_ceil(columns) as u32;

@@ -135,7 +135,7 @@ impl RotateShift {
         for s in &row.segments {
             let (target, fx, fy) = (&mut target[s.from..s.to], &row.fx[s.from..s.to], &row.fy[s.from..s.to]);
             let n = target.len();
-            if s.x >= 0 && s.x + n as i32 + 1 <= w && s.y >= 0 && s.y + 1 < self.height as i32 {
+            if s.x >= 0 && s.x + (n as i32) < w && s.y >= 0 && s.y + 1 < self.height as i32 {
                 let i = s.y as usize * self.width + s.x as usize;
                 let (a, b) = (&plane[i..][..n + 1], &plane[i + self.width..][..n + 1]);
                 for k in 0..n {
@@ -222,7 +222,7 @@ impl RotateShift {
                 }
                 let line = &mut part[(y - first) as usize * self.width..][..self.width];
                 let weight = |k: usize| if lower { fy[k] } else { 1.0 - fy[k] };
-                if s.x >= 0 && s.x + n as i32 + 1 <= w {
+                if s.x >= 0 && s.x + (n as i32) < w {
                     let line = &mut line[s.x as usize..][..n + 1];
                     for k in 0..n {
                         line[k] += weight(k) * (1.0 - fx[k]) * source[k];

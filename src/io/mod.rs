@@ -45,6 +45,7 @@ pub(crate) fn plain(e: &std::io::Error) -> String {
 }
 
 /// The picture turned and mirrored so that it is upright; `orientation` as EXIF counts it, 1 to 8.
+#[cfg(feature = "raw")]
 pub(crate) fn upright(image: &Rgb, orientation: u32) -> Rgb {
     let (w, h) = image.size();
     image.map_planes(|p| match orientation {

@@ -150,8 +150,9 @@ impl<'a> Evidence<'a> {
                     let (values, motions) = self.look(chart, &pose);
                     let mut out = Vec::with_capacity(rows * per);
                     let w = *w as f32;
+                    let along = |k: usize, i: u32| motions[i as usize][k];
                     for k in 0..free {
-                        out.extend(self.rows.iter().map(|&(a, b, s)| s * w * (motions[b as usize][k] - motions[a as usize][k])));
+                        out.extend(self.rows.iter().map(|&(a, b, s)| s * w * (along(k, b) - along(k, a))));
                     }
                     out.extend(self.rows.iter().map(|&(a, b, s)| s * (values[b as usize] - values[a as usize])));
                     out

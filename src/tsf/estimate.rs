@@ -328,13 +328,15 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
     };
     let block = w.max(h).div_ceil(BLOCKS);
-    let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13) % 5 == 0;
+    let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13).is_multiple_of(5);
     let mut trials = Vec::new();
     let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
     if search.model == Model::Auto {
         let (outside, inside): (Vec<Row>, Vec<Row>) = all.iter().partition(|r| held(r));
         let judge = Evidence::new(frame, &outside);
-        let mut tried: Vec<(Model, f64, Vec<(usize, f64)>)> = Vec::new();
+        // Model, focal length, and the residual of each block of held-out differences.
+        type Tried = (Model, f64, Vec<(usize, f64)>);
+        let mut tried: Vec<Tried> = Vec::new();
         let mut attempt = |model: Model, focal: f64| {
             let t = fit(&inside, model, focal, &start, TRIAL);
             let r = judge.residual(&t);

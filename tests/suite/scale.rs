@@ -128,7 +128,7 @@ fn reduced_frames_are_means_of_irradiance() {
     let small = response::reduced(&bracket, &Response::Srgb, 4).expect("large enough");
     let clipped: Vec<usize> = (0..256).filter(|&i| small.frames()[1].intensity.0[0].data[i] >= 1.0).collect();
     assert_eq!(clipped, [5 * 16 + 9]);
-    let error = response::reduced(&bracket, &Response::Srgb, 8).err().expect("too small").to_string();
+    let error = response::reduced(&bracket, &Response::Srgb, 8).expect_err("too small").to_string();
     assert!(error.contains("8 x 8") && error.contains("--scale"), "{error}");
 }
 
