@@ -17,6 +17,8 @@ use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 mod blind;
@@ -157,6 +159,7 @@ struct Run<'a> {
     gpu: &'a Gpu,
     kernels: &'a Kernels,
     memo: &'a mut Memo,
+    stop: Option<Arc<AtomicBool>>,
     bracket: &'a Bracket,
     settings: &'a Settings,
     exposures: Vec<Rgb>,
@@ -206,6 +209,7 @@ pub fn merge_with(
 ) -> Result<Outcome> {
     let frames = bracket.frames();
     let excluded = check(bracket, settings)?;
+    let stop = engine.stop.clone();
     let (gpu, kernels, memo) = engine.parts(settings.deblur.interpolation);
     let start = Instant::now();
     // TSFs that are given decide about every stage.
@@ -222,6 +226,7 @@ pub fn merge_with(
         gpu,
         kernels,
         memo,
+        stop,
         bracket,
         settings,
         exposures,
@@ -281,23 +286,43 @@ impl Run<'_> {
         Ok(out)
     }
 
-    /// [`Run::timed`], unless an earlier merge has been here with the same settings: then what it found, and what it said.
-    fn remembered<T: Clone + Send + 'static>(&mut self, stage: &str, f: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
-        if let Some((found, said)) = self.memo.recall::<T>(stage) {
+    /// [`Run::timed`], unless an earlier merge has been here with the same settings: then what it found, and what it said. `more`: what it
+    /// depends on besides all that came before; `bytes`: size of what is found.
+    fn remembered<T: Clone + Send + 'static>(
+        &mut self,
+        name: &str,
+        more: &str,
+        bytes: fn(&T) -> usize,
+        f: impl FnOnce(&mut Self) -> Result<T>,
+    ) -> Result<T> {
+        let stage = format!("{name} {more}");
+        if let Some((found, said)) = self.memo.recall::<T>(&stage) {
             for text in said {
                 self.warn(text)?;
             }
             return Ok(found);
         }
         let before = self.memo.said();
-        let found = self.timed(stage.split(' ').next().unwrap_or(stage), f)?;
-        self.memo.keep(stage, &found, before);
+        let found = self.timed(name, f)?;
+        // What was stopped half-way is nothing to remember.
+        if self.stop.as_ref().is_some_and(|s| s.load(Ordering::Relaxed)) {
+            return Err(Error::Cancelled);
+        }
+        self.memo.keep(&stage, &found, before, bytes(&found));
         Ok(found)
     }
 
     /// [`Run::remembered`] of a stage that solves with `settings`.
-    fn solved(&mut self, stage: &str, settings: &deblur::Settings, f: impl FnOnce(&mut Self) -> Result<Solution>) -> Result<Solution> {
-        self.remembered(&format!("{stage} {settings:?}"), f)
+    fn solved(
+        &mut self,
+        name: &str,
+        more: &str,
+        settings: &deblur::Settings,
+        f: impl FnOnce(&mut Self) -> Result<Solution>,
+    ) -> Result<Solution> {
+        let bytes =
+            |s: &Solution| 4 * (3 * s.irradiance.width() * s.irradiance.height() + s.misfit.iter().map(|m| m.data.len()).sum::<usize>());
+        self.remembered(name, &format!("{more} {settings:?}"), bytes, f)
     }
 
     /// A frame is left out because of what was found about it.
@@ -392,10 +417,15 @@ impl Run<'_> {
         let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
         let verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
             self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
-            let (verdicts, found, motions, registrations, left_out) = self.remembered("registration", |run| {
-                let verdicts = run.align(verdicts, &mut excluded, &known)?;
-                Ok((verdicts, excluded.clone(), run.motions.clone(), run.registrations.clone(), run.left_out.clone()))
-            })?;
+            let (verdicts, found, motions, registrations, left_out) = self.remembered(
+                "registration",
+                "",
+                |_| 0,
+                |run| {
+                    let verdicts = run.align(verdicts, &mut excluded, &known)?;
+                    Ok((verdicts, excluded.clone(), run.motions.clone(), run.registrations.clone(), run.left_out.clone()))
+                },
+            )?;
             (excluded, self.motions, self.registrations, self.left_out) = (found, motions, registrations, left_out);
             verdicts
         } else {
@@ -421,10 +451,15 @@ impl Run<'_> {
         if merged_only {
             self.warn("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || (!all_known && !sharp.contains(&true)) {
-            let (found, motions, blind) = self.remembered("all blurs", |run| {
-                let found = run.joint(&used, 0.03, 0.60)?;
-                Ok((found, run.motions.clone(), run.blind.clone()))
-            })?;
+            let (found, motions, blind) = self.remembered(
+                "all blurs",
+                "",
+                |_| 0,
+                |run| {
+                    let found = run.joint(&used, 0.03, 0.60)?;
+                    Ok((found, run.motions.clone(), run.blind.clone()))
+                },
+            )?;
             (self.motions, self.blind) = (motions, blind);
             match found {
                 Some(found) => {
@@ -477,7 +512,7 @@ impl Run<'_> {
         let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
         let initial = initial.map_planes(|p| p.padded(pad));
-        let base = self.solved("sharp frames", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
+        let base = self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
         let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
@@ -505,8 +540,8 @@ impl Run<'_> {
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                    let now = format!("refinement {i} {round} {shaken:?}");
-                    tsfs[i] = self.remembered(&now, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
+                    let now = format!("{i} {round} {shaken:?}");
+                    tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
@@ -523,8 +558,9 @@ impl Run<'_> {
             } else {
                 self.settings.deblur.clone()
             };
-            let now = format!("irradiance {round} {shaken:?}");
-            let solved = self.solved(&now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
+            let now = format!("{round} {shaken:?}");
+            let solved =
+                self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
             // TSFs that the user gave are believed.
             let hopeless: Vec<(usize, f64)> = estimated
@@ -551,7 +587,7 @@ impl Run<'_> {
             Some(found) => found,
             // No shaken frame is left: the sharp ones alone, as the user wants them.
             None if first != alone => {
-                self.solved("sharp frames", &alone, |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.90, 0.98))?
+                self.solved("sharp frames", "alone", &alone, |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.90, 0.98))?
             }
             None => base,
         };
@@ -663,11 +699,11 @@ impl Run<'_> {
 
     /// TSF of frame `i` against the sharp irradiance, and, for people to look at, patches and their PSFs (11).
     fn blur(&mut self, i: usize, latent: &Rgb) -> Result<(Option<Tsf>, Value)> {
-        let stage = format!("blur {i} {:?} {:?}", self.settings.model, self.settings.focal_px);
-        let (tsf, mut detail) = self.remembered(&stage, |run| Ok(run.estimate(i, latent)))?;
+        let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
+        let (tsf, mut detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, latent)))?;
         if let Some(tsf) = &tsf {
-            let stage = format!("{stage} PSFs {:?} {:?}", self.settings.patches, self.settings.psf_radius);
-            detail["patches"] = self.remembered(&stage, |run| Ok(run.patches(i, latent, tsf)))?;
+            let own = format!("{own} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
+            detail["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.patches(i, latent, tsf)))?;
         }
         Ok((tsf, detail))
     }
@@ -680,7 +716,7 @@ impl Run<'_> {
         let (blurred, weight) = self.luminance(i, &seen);
         let weight = weight.zip(&inside, |w, k| w * k);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
-        let search = Search { model: self.settings.model, focal_px: self.settings.focal_px };
+        let search = Search { model: self.settings.model, focal_px: self.settings.focal_px, stop: self.stop.clone() };
         let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
         let detail = json!({
             "model": found.model,

@@ -7,21 +7,26 @@ use crate::noise::NoiseModel;
 use crate::tsf::Interpolation;
 use std::any::Any;
 use std::fmt::Debug;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
-/// Results that are kept, over all stages: those of two full runs of a bracket, so that an edit can be taken back at no cost.
-const KEPT: usize = 48;
+/// Results that are kept, over all stages and sizes.
+const KEPT: usize = 96;
+/// Bytes of planes among them: two runs of a bracket of five frames of 12 MP, so that an edit can be taken back at no cost.
+const ROOM: usize = 3 << 30;
 
 /// The device, its kernels, and what earlier merges found out.
 pub struct Engine {
     gpu: Gpu,
     kernels: Option<(Interpolation, Kernels)>,
     memo: Memo,
+    pub(super) stop: Option<Arc<AtomicBool>>,
 }
 
 impl Engine {
     /// An engine that forgets each merge.
     pub fn new(gpu: Gpu) -> Self {
-        Self { gpu, kernels: None, memo: Memo::default() }
+        Self { gpu, kernels: None, memo: Memo::default(), stop: None }
     }
 
     /// An engine that remembers: it holds several planes per frame in memory.
@@ -32,6 +37,11 @@ impl Engine {
     /// The device.
     pub fn gpu(&self) -> &Gpu {
         &self.gpu
+    }
+
+    /// Long steps look at `stop` themselves from now on: a merge ends, as cancelled, soon after it is set.
+    pub fn stops_at(&mut self, stop: Arc<AtomicBool>) {
+        self.stop = Some(stop);
     }
 
     /// Forgets everything, for other frames.
@@ -61,6 +71,7 @@ impl Engine {
 /// What one stage found and said.
 struct Kept {
     key: String,
+    bytes: usize,
     found: Box<dyn Any + Send>,
     said: Vec<String>,
 }
@@ -113,14 +124,18 @@ impl Memo {
         found
     }
 
-    /// Keeps what `stage` found, and all that was said after the first `before`.
-    pub fn keep<T: Clone + Send + 'static>(&mut self, stage: &str, found: &T, before: usize) {
+    /// Keeps what `stage` found, which is some `bytes` large, and all that was said after the first `before`.
+    pub fn keep<T: Clone + Send + 'static>(&mut self, stage: &str, found: &T, before: usize, bytes: usize) {
         let Some(key) = &self.key else { return };
         self.ran.push(stage.split('{').next().unwrap_or(stage).trim().into());
         let (key, said) = (format!("{key}|{stage}"), self.said[before.min(self.said.len())..].to_vec());
-        self.kept.push(Kept { key, found: Box::new(found.clone()), said });
-        let surplus = self.kept.len().saturating_sub(KEPT);
-        self.kept.drain(..surplus);
+        if bytes > ROOM / 2 {
+            return;
+        }
+        self.kept.push(Kept { key, bytes, found: Box::new(found.clone()), said });
+        while self.kept.len() > KEPT || self.kept.iter().map(|k| k.bytes).sum::<usize>() > ROOM {
+            self.kept.remove(0);
+        }
     }
 
     /// Exposures and noise, made or remembered.
@@ -129,7 +144,8 @@ impl Memo {
             return found;
         }
         let found = make();
-        self.keep("exposures", &found, 0);
+        let pixels: usize = found.0.iter().map(|e| e.width() * e.height()).sum();
+        self.keep("exposures", &found, 0, 12 * pixels);
         found
     }
 }

@@ -120,6 +120,8 @@ pub struct Message {
     pub error: bool,
     /// What a button offers.
     pub offer: Option<Offer>,
+    /// Whether the next solution makes it obsolete.
+    pub passing: bool,
 }
 
 /// What a message's button does.
@@ -211,6 +213,9 @@ pub struct App {
     pub(super) probe: Option<(usize, usize)>,
     /// Text of exposure times while they are being typed.
     pub(super) typed: HashMap<PathBuf, String>,
+    /// The same of the response and of the memory: each is taken when it is complete.
+    pub(super) typed_response: String,
+    pub(super) typed_memory: String,
 }
 
 impl App {
@@ -280,6 +285,8 @@ impl App {
             help: false,
             probe: None,
             typed: HashMap::new(),
+            typed_response: String::new(),
+            typed_memory: String::new(),
         };
         match session {
             Some((session, saved)) => {
@@ -337,7 +344,15 @@ impl App {
     pub(super) fn say(&mut self, text: impl Into<String>, error: bool, offer: Option<Offer>) {
         let text = text.into();
         if !self.messages.iter().any(|m| m.text == text) {
-            self.messages.push(Message { text, error, offer });
+            self.messages.push(Message { text, error, offer, passing: false });
+        }
+    }
+
+    /// Says what the next solution makes obsolete.
+    fn say_of_solution(&mut self, text: String, error: bool, offer: Option<Offer>) {
+        self.say(text, error, offer);
+        if let Some(last) = self.messages.last_mut() {
+            last.passing = true;
         }
     }
 
@@ -365,6 +380,7 @@ impl App {
         self.recent.add(files);
         self.messages.clear();
         self.cancel();
+        self.serial += 1;
         self.history = History::default();
         self.session = session;
         self.ready = None;
@@ -471,8 +487,7 @@ impl App {
             began: Instant::now(),
             session: session.clone(),
         });
-        self.messages.retain(|m| m.error && m.offer.is_none());
-        self.messages.clear();
+        self.messages.retain(|m| !m.passing);
         self.workers.solve(Request { serial: self.serial, session, noted: self.noted(), stop });
     }
 
@@ -493,7 +508,8 @@ impl App {
                 self.thumbs.insert(path, found);
             }
             News::Ready(serial, ready) => {
-                if current(serial, &self.running) {
+                // Even when it was stopped meanwhile: the frames are these.
+                if serial == self.serial {
                     if self.ready.as_ref().is_none_or(|r| !Arc::ptr_eq(r, &ready)) {
                         self.forget_pictures();
                     }
@@ -510,7 +526,7 @@ impl App {
             }
             News::Warning(serial, text) => {
                 if current(serial, &self.running) {
-                    self.say(text, false, None);
+                    self.say_of_solution(text, false, None);
                 }
             }
             News::Estimate(serial, estimate) => {
@@ -540,7 +556,7 @@ impl App {
                             Failure::Lost(_) => Some(Offer::Reopen),
                             Failure::Other(_) => None,
                         };
-                        self.say(failure.text().to_string(), true, offer);
+                        self.say_of_solution(failure.text().to_string(), true, offer);
                     }
                 }
             }
@@ -797,7 +813,7 @@ impl App {
 
     fn main_view(&mut self, ui: &mut egui::Ui) -> Option<canvas::Layout> {
         let (rect, response) = ui.allocate_exact_size(ui.available_size(), egui::Sense::click_and_drag());
-        response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Image, true, "Picture"));
+        response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Image, true, "Main view"));
         let dark = ui.visuals().dark_mode;
         ui.painter().rect_filled(rect, 0.0, if dark { Color32::from_gray(18) } else { Color32::from_gray(200) });
         let Some(size) = self.size() else {

@@ -80,7 +80,7 @@ fn glyph(values: &[f32], side: usize) -> egui::ColorImage {
 }
 
 /// The PSF that `tsf` makes at the frame's pixel `p` (centred pixels): square of side 2 · radius + 1, bilinear.
-fn psf_at(tsf: &Tsf, p: DVec2, radius: usize) -> Plane {
+pub fn psf_at(tsf: &Tsf, p: DVec2, radius: usize) -> Plane {
     let side = 2 * radius + 1;
     let mut psf = Plane::filled(side, side, 0.0);
     let centre = project(&tsf.centre(), p) - p;
@@ -280,7 +280,7 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
 }
 
 /// Edges of the shortest tree that joins the poses where they lie: a camera moves from pose to neighbouring pose.
-fn tree(places: &[Pos2]) -> Vec<(usize, usize)> {
+pub fn tree(places: &[Pos2]) -> Vec<(usize, usize)> {
     let n = places.len();
     let mut nearest: Vec<(f32, usize)> = vec![(f32::INFINITY, 0); n];
     let mut joined = vec![false; n];
@@ -415,40 +415,9 @@ fn plot(app: &mut App, ui: &mut egui::Ui, tsf: &Tsf, scale: f64) {
 }
 
 /// The next 1, 2 or 5 times a power of ten.
-fn nice(v: f64) -> f64 {
+pub fn nice(v: f64) -> f64 {
     let power = 10f64.powf(v.log10().floor());
     let lead = [1.0, 2.0, 5.0, 10.0].into_iter().find(|k| k * power >= v * 0.999).unwrap_or(10.0);
     // Without the error of the power.
     format!("{:.3e}", lead * power).parse().unwrap_or(v)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::pose::Pose;
-
-    #[test]
-    fn a_drawn_psf_holds_all_of_the_time_and_is_centred() {
-        let tsf = Tsf::new(500.0, vec![Pose::planar(-2.0, 1.0, 0.0, 0.5), Pose::planar(3.0, -1.0, 0.3, 0.5)]).unwrap();
-        let psf = psf_at(&tsf, DVec2::new(30.0, -20.0), 8);
-        let sum: f32 = psf.data.iter().sum();
-        assert!((sum - 1.0).abs() < 1e-5, "{sum}");
-        let x: f32 = psf.data.iter().enumerate().map(|(i, v)| v * ((i % 17) as f32 - 8.0)).sum();
-        assert!(x.abs() < 0.05, "centre of mass {x}");
-        // A later pose to the right shows right of the centre.
-        assert!(psf.data[7 * 17 + 10] + psf.data[7 * 17 + 11] > 0.1);
-    }
-
-    #[test]
-    fn axes_end_at_round_numbers() {
-        assert_eq!([nice(0.7), nice(3.2), nice(10.0), nice(0.013)], [1.0, 5.0, 10.0, 0.02]);
-    }
-
-    #[test]
-    fn a_path_joins_neighbours() {
-        let places = [0.0, 10.0, 4.0, 7.0].map(|x| Pos2::new(x, 0.0));
-        let mut edges = tree(&places).into_iter().map(|(a, b)| (a.min(b), a.max(b))).collect::<Vec<_>>();
-        edges.sort_unstable();
-        assert_eq!(edges, [(0, 2), (1, 3), (2, 3)]);
-    }
 }

@@ -193,11 +193,14 @@ impl egui_wgpu::CallbackTrait for Draw {
 pub fn draw(ui: &egui::Ui, layout: &Layout, size: Vec2, split: f32, shown: Shown) {
     let per_point = ui.ctx().pixels_per_point();
     let origin = (layout.rect.min.to_vec2() * per_point).round();
+    // Pixels of the frame begin where pixels of the screen do.
+    let per_pixel = 1.0 / (layout.zoom * per_point);
+    let pan = if per_pixel <= 1.0 { (layout.pan / per_pixel).round() * per_pixel } else { layout.pan };
     let params = DisplayParams {
         origin: [origin.x, origin.y],
-        pan: [layout.pan.x, layout.pan.y],
+        pan: [pan.x, pan.y],
         frame: [size.x, size.y],
-        per_pixel: 1.0 / (layout.zoom * per_point),
+        per_pixel,
         split: split * layout.rect.width() * per_point,
         a: shown.a.as_ref().map(|p| p.place).unwrap_or_default(),
         b: shown.b.as_ref().map(|p| p.place).unwrap_or_default(),

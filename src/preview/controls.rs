@@ -166,7 +166,6 @@ fn look(app: &mut App, ui: &mut egui::Ui) {
 fn parameters(app: &mut App, ui: &mut egui::Ui) {
     heading(ui, "Solve");
     let frames = app.session.shots.len();
-    let busy = app.running.is_some();
     let p = &mut app.session.parameters;
     ui.checkbox(&mut app.live, "Solve after each edit");
     ui.add(Slider::new(&mut p.lambda, 0.1..=20.0).logarithmic(true).text("Smoothness, lambda").max_decimals(2))
@@ -206,9 +205,24 @@ fn parameters(app: &mut App, ui: &mut egui::Ui) {
     ui.checkbox(&mut p.align, "Register the frames");
     ui.horizontal(|ui| {
         let label = ui.label("Response");
-        ui.add_enabled(!busy, egui::TextEdit::singleline(&mut p.response).desired_width(120.0).hint_text("as the files say"))
-            .labelled_by(label.id)
-            .on_hover_text("auto, srgb, linear, gamma:2.2 or a file from 'unshaken calibrate'");
+        let edit = egui::TextEdit::singleline(&mut app.typed_response).desired_width(120.0).hint_text("as the files say");
+        let response =
+            ui.add(edit).labelled_by(label.id).on_hover_text("auto, srgb, linear, gamma:2.2 or a file from 'unshaken calibrate'");
+        if response.lost_focus() {
+            p.response = app.typed_response.trim().to_string();
+        } else if !response.has_focus() {
+            app.typed_response.clone_from(&p.response);
+        }
+    });
+    ui.horizontal(|ui| {
+        let label = ui.label("GPU memory");
+        let edit = egui::TextEdit::singleline(&mut app.typed_memory).desired_width(120.0).hint_text("all there is");
+        let response = ui.add(edit).labelled_by(label.id).on_hover_text("At most this much, such as 2GiB; less is slower");
+        if response.lost_focus() {
+            p.memory_limit = app.typed_memory.trim().to_string();
+        } else if !response.has_focus() {
+            app.typed_memory.clone_from(&p.memory_limit);
+        }
     });
     if ui.button("Reset the parameters").clicked() {
         *p = super::session::Parameters::default();

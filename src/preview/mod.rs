@@ -6,13 +6,13 @@
 //! ([`worker`]).
 
 pub mod app;
-mod blur;
+pub mod blur;
 mod canvas;
 mod controls;
 mod export;
 pub mod session;
 pub mod shortcuts;
-mod strip;
+pub mod strip;
 pub mod worker;
 
 pub use app::App;

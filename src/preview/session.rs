@@ -66,6 +66,8 @@ pub struct Parameters {
     pub reference: Option<usize>,
     /// The number that `--scale` is one over.
     pub divisor: usize,
+    /// `--memory-limit`; empty: all there is.
+    pub memory_limit: String,
 }
 
 impl Default for Parameters {
@@ -82,6 +84,7 @@ impl Default for Parameters {
             response: String::new(),
             reference: None,
             divisor: 1,
+            memory_limit: String::new(),
         }
     }
 }
@@ -155,6 +158,9 @@ impl Session {
         }
         if !p.response.is_empty() {
             all.push(("response", Some(p.response.clone())));
+        }
+        if !p.memory_limit.is_empty() {
+            all.push(("memory-limit", Some(p.memory_limit.clone())));
         }
         if let Some(i) = p.reference {
             all.push(("reference", Some((i + 1).to_string())));

@@ -209,20 +209,3 @@ pub fn status(app: &mut App, ui: &mut egui::Ui) {
         app.cancel();
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn times_are_read_as_photographers_write_them() {
-        assert_eq!(seconds("1/30"), Some(1.0 / 30.0));
-        assert_eq!(seconds(" 0.5 s"), Some(0.5));
-        assert_eq!(seconds("0"), None);
-        assert_eq!(seconds("1/0"), None);
-        assert_eq!(seconds("soon"), None);
-        assert_eq!(time(1.0 / 30.0), "1/30 s");
-        assert_eq!(time(2.5), "2.5 s");
-        assert_eq!(seconds(&time(1.0 / 125.0)), Some(1.0 / 125.0));
-    }
-}

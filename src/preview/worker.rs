@@ -365,6 +365,7 @@ impl Solver {
         let arguments = session.arguments(noted, Path::new("result.exr"));
         let going = || !stop.load(Ordering::Relaxed);
         let tell = self.tell.clone();
+        self.engine.stops_at(stop.clone());
         let frames: Vec<_> = session.shots.iter().map(|s| (&s.path, s.exposure_time)).collect();
         let name = format!("{frames:?} {} {noted:?}", session.parameters.response);
         if self.opened.as_ref().is_none_or(|o| o.0 != name) {
@@ -440,7 +441,7 @@ fn hear(tell: &dyn Fn(News), serial: u64, divisor: usize, event: Event) -> bool 
 }
 
 /// Sizes at which frames of `size` are solved, as numbers that they are one over: from `first` pixels or fewer to one over `last`.
-fn divisors(size: (usize, usize), last: usize, first: usize) -> Vec<usize> {
+pub fn divisors(size: (usize, usize), last: usize, first: usize) -> Vec<usize> {
     let last = last.max(1);
     let mut all = vec![last];
     let pixels = |d: usize| (size.0 / d) * (size.1 / d);
@@ -499,29 +500,4 @@ pub fn masks(solved: &Solved) -> Vec<Plane> {
     let sharp: Vec<bool> = (0..frames.len()).map(|i| report[i]["sharp"] == true).collect();
     let still = vec![glam::DMat3::IDENTITY; frames.len()];
     mask::masks(frames, &sharp, solved.session.parameters.alpha as f32, &still)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_double_up_to_the_one_that_is_wanted() {
-        assert_eq!(divisors((1024, 1024), 1, 70_000), [4, 2, 1]);
-        assert_eq!(divisors((200, 150), 1, 70_000), [1]);
-        assert_eq!(divisors((1024, 1024), 2, 70_000), [4, 2]);
-        // Never too small to register.
-        assert_eq!(divisors((6000, 100), 1, 1000), [2, 1]);
-    }
-
-    #[test]
-    fn a_histogram_counts_every_lit_pixel_once() {
-        let image = Rgb(std::array::from_fn(|c| Plane { width: 4, height: 1, data: vec![0.0, 1.0, 2.0, [1.0, 8.0, 0.25][c]] }));
-        let found = Histogram::of(&image);
-        for bins in &found.bins {
-            assert!((bins.iter().sum::<f32>() - 0.75).abs() < 1e-6);
-        }
-        assert_eq!(found.first, -2.0);
-        assert_eq!(found.bins[1][5 * BINS_PER_STOP], 0.25, "8 lies five stops above a quarter");
-    }
 }

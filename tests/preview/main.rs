@@ -3,6 +3,8 @@
 /// The window, its picture, a bracket's files.
 mod support;
 
+/// What the window is made of: times, histogram, PSFs, keys.
+mod parts;
 /// Undo, session files, the command line that a session is.
 mod sessions;
 /// Labels, clicks, keys, the divider, error messages.

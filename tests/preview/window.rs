@@ -4,6 +4,7 @@ use egui_kittest::kittest::Queryable;
 use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 use unshaken::preview::Options;
 use unshaken::preview::app::Over;
 use unshaken::preview::session::Session;
@@ -25,13 +26,14 @@ fn an_empty_window_says_what_to_do() {
     let mut window = Window::open(&[]);
     window.harness.run_steps(2);
     window.picture();
-    assert!(window.harness.query_by_label("Picture").is_some());
-    click(&mut window, "Help");
-    click(&mut window, "Keyboard shortcuts F1");
-    assert!(window.harness.query_by_label("Mark what the tone curve clips").is_some());
+    assert!(window.harness.query_by_label("Main view").is_some());
+    window.harness.key_press(Key::F1);
+    window.harness.run_steps(3);
+    assert!(window.harness.query_by_label("Half a stop brighter").is_some());
+    window.picture();
     window.harness.key_press(Key::Escape);
     window.harness.run_steps(3);
-    assert!(window.harness.query_by_label("Double click").is_none(), "Escape closes the sheet");
+    assert!(window.harness.query_by_label("Half a stop brighter").is_none(), "Escape closes the sheet");
 }
 
 /// One solution, and everything that needs one: a device and a solve are dear.
@@ -47,7 +49,7 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     assert!(window.harness.query_by_label_contains("Frame 3: blurred").is_some());
 
     // The picture is tone mapped as `--preview` would be: beyond the divider the result, pixel for pixel.
-    let view = window.harness.get_by_label("Picture").rect();
+    let view = window.harness.get_by_label("Main view").rect();
     window.harness.key_press(Key::D);
     window.harness.key_press(Key::Num1);
     window.harness.run_steps(4);
@@ -56,11 +58,10 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     let time = solved.bracket.frames()[solved.outcome.reference].exposure_time as f32;
     let wanted = Operator::default().apply(&solved.outcome.irradiance.map_planes(|p| p.map(|v| v / time)));
     let (w, h) = (wanted.width() as i64, wanted.height() as i64);
-    let corner = view.center() - 0.5 * Vec2::new(w as f32, h as f32);
-    let (x0, y0) = (corner.x.round() as i64, corner.y.round() as i64);
+    let pan = (0.5 * Vec2::new(w as f32, h as f32) - 0.5 * view.size()).round();
+    let (x0, y0) = ((view.left().round() - pan.x) as i64, (view.top().round() - pan.y) as i64);
     let mut far = 0;
     for (x, y, p) in wanted.enumerate_pixels() {
-        // The name in the corner lies over the picture.
         let q = shown.get_pixel((x0 + i64::from(x)) as u32, (y0 + i64::from(y)) as u32);
         far += usize::from((0..3).any(|c| p.0[c].abs_diff(q.0[c]) > 2));
     }
@@ -108,9 +109,11 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
         window.harness.run_steps(3);
         assert_eq!(window.app().overlay(), expected);
     }
-    std::thread::sleep(std::time::Duration::from_millis(200));
-    window.harness.run_steps(4);
-    assert_ne!(at(&window.picture(), 0.45), at(&divided, 0.45), "the residual is drawn");
+    let end = Instant::now() + Duration::from_secs(30);
+    while at(&window.picture(), 0.45) == at(&divided, 0.45) {
+        assert!(Instant::now() < end, "the residual is not drawn");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     window.harness.key_press(Key::O);
 
     // The blur view.
@@ -130,7 +133,7 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     });
     let again = window.app().solution().unwrap().clone();
     assert_eq!(again.ran.len(), 1, "only the PSFs are measured again: {:?}", again.ran);
-    assert!(again.ran[0].contains("PSFs"));
+    assert!(again.ran[0].starts_with("PSFs"));
     assert_eq!(again.outcome.irradiance, solved.outcome.irradiance);
     window.picture();
     window.harness.key_press(Key::B);
@@ -147,9 +150,9 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     window.harness.run_steps(3);
     window.picture();
     click(&mut window, "Write the files");
-    let end = std::time::Instant::now() + std::time::Duration::from_secs(30);
-    while !target.exists() && std::time::Instant::now() < end {
-        std::thread::sleep(std::time::Duration::from_millis(30));
+    let end = Instant::now() + Duration::from_secs(30);
+    while !target.exists() && Instant::now() < end {
+        std::thread::sleep(Duration::from_millis(30));
         window.harness.step();
     }
     assert!(target.exists() && target.with_extension("png").exists() && target.with_extension("json").exists());
@@ -180,6 +183,8 @@ fn a_parameter_runs_only_the_stages_that_it_touches() {
         "{first:?}"
     );
     // Reset: lambda goes back to its default.
+    window.harness.get_by_label("Reset the parameters").scroll_to_me();
+    window.harness.run_steps(4);
     click(&mut window, "Reset the parameters");
     window.wait("the second solution", 240, |app| {
         !app.is_busy() && app.solution().is_some_and(|s| s.divisor == 1 && s.session.parameters.lambda == 2.5)
@@ -256,6 +261,21 @@ fn what_cannot_be_read_is_said_in_the_window() {
 }
 
 #[test]
+fn without_memory_a_smaller_size_is_offered_and_taken() {
+    let (folder, files) = bracket();
+    let mut s = Session::of(files);
+    s.parameters.memory_limit = "1MiB".into();
+    let path = folder.path().join("s.json");
+    s.save(&path).unwrap();
+    let mut window = Window::open(&[path]);
+    window.wait("the message", 120, |app| !app.is_busy() && !app.texts().is_empty());
+    window.picture();
+    assert!(window.app().texts().iter().any(|t| t.contains("memory")), "{:?}", window.app().texts());
+    click(&mut window, "Solve at 1/2 of the size");
+    assert_eq!(window.app().session().parameters.divisor, 2);
+}
+
+#[test]
 fn a_device_that_is_lost_is_opened_anew_with_the_session() {
     let (_folder, files) = bracket();
     let mut window = Window::open(&files);
@@ -281,7 +301,7 @@ fn the_window_is_whole_at_twice_the_pixels_and_in_light_colours() {
     window.wait("the plain merge", 120, |app| app.solution().is_some());
     let picture = window.picture();
     assert_eq!((picture.width(), picture.height()), (2 * SIZE.x as u32, 2 * SIZE.y as u32));
-    let view = window.harness.get_by_label("Picture").rect();
+    let view = window.harness.get_by_label("Main view").rect();
     // The frame fills the view's height or width: its middle row is not background.
     let y = (2.0 * view.center().y) as u32;
     let of = |x: f32| picture.get_pixel((2.0 * x) as u32, y).0;
