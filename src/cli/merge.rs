@@ -21,8 +21,12 @@ use std::sync::Arc;
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
-    let job = Job::of(args)?;
-    let targets = outputs(args, job.response_file.as_deref())?;
+    let mut targets = None;
+    let job = Job::of(args, &mut |response_file| {
+        targets = Some(outputs(args, response_file)?);
+        Ok(())
+    })?;
+    let targets = targets.expect("set before the job is understood");
     let (text, quality) = with_progress(|events| {
         let opened = job.open(events)?;
         let settings = job.settings(&opened)?.reduced(job.divisor);
@@ -52,7 +56,6 @@ pub(super) struct Job<'a> {
     settings: Settings,
     divisor: usize,
     response: Option<Response>,
-    pub response_file: Option<PathBuf>,
     tsf: Option<TsfFile>,
     photo: PhotoSettings,
 }
@@ -70,7 +73,8 @@ pub(super) struct Opened {
 }
 
 impl<'a> Job<'a> {
-    pub fn of(args: &'a MergeArgs) -> anyhow::Result<Self> {
+    /// `check` looks at the outputs, given the response file, before any file is read.
+    pub fn of(args: &'a MergeArgs, check: &mut dyn FnMut(Option<&Path>) -> anyhow::Result<()>) -> anyhow::Result<Self> {
         let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
         let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
         let settings = settings(args)?;
@@ -79,6 +83,7 @@ impl<'a> Job<'a> {
         let word = args.response.as_deref().filter(|r| *r != "auto");
         let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
         let response_file = word.filter(|_| named.is_none()).map(PathBuf::from);
+        check(response_file.as_deref())?;
         let photo = PhotoSettings::of(args)?;
         let response = match (named, &response_file) {
             (None, Some(path)) => Some(read_response(path)?),
@@ -88,7 +93,7 @@ impl<'a> Job<'a> {
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsf_names(file, path, &args.frames)?;
         }
-        Ok(Self { args, times, values, settings, divisor, response, response_file, tsf, photo })
+        Ok(Self { args, times, values, settings, divisor, response, tsf, photo })
     }
 
     /// Reads the frames and finds their response.

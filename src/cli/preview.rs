@@ -81,7 +81,7 @@ fn own(opened: &Opened) -> anyhow::Result<&merge::Opened> {
 impl Program for Merge {
     fn open(&self, arguments: &[OsString], events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened> {
         let args = understood(arguments)?;
-        let opened = Job::of(&args)?.open(events)?;
+        let opened = Job::of(&args, &mut |_| Ok(()))?.open(events)?;
         let back = colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries");
         Ok(Opened {
             bracket: opened.bracket.clone(),
@@ -93,7 +93,7 @@ impl Program for Merge {
 
     fn settings(&self, arguments: &[OsString], opened: &Opened) -> anyhow::Result<Settings> {
         let args = understood(arguments)?;
-        Job::of(&args)?.settings(own(opened)?)
+        Job::of(&args, &mut |_| Ok(()))?.settings(own(opened)?)
     }
 
     fn write(
@@ -105,8 +105,12 @@ impl Program for Merge {
         warnings: &[String],
     ) -> anyhow::Result<String> {
         let args = understood(arguments)?;
-        let job = Job::of(&args)?;
-        let targets = merge::outputs(&args, job.response_file.as_deref())?;
+        let mut targets = None;
+        let job = Job::of(&args, &mut |response_file| {
+            targets = Some(merge::outputs(&args, response_file)?);
+            Ok(())
+        })?;
+        let targets = targets.expect("set before the job is understood");
         let mut said = Vec::new();
         let text = job.write(&targets, own(opened)?, bracket, outcome, warnings, &mut |event| {
             if let Event::Warning(text) = event {

@@ -7,6 +7,7 @@ pub use kernel::{Kernel, Step, grid_1d};
 pub use readback::read;
 
 use crate::error::{Error, Result};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
@@ -39,8 +40,16 @@ pub struct Gpu {
     memory_limit: u64,
     /// Bytes of planes made since [`Gpu::start_count`].
     counted: AtomicU64,
-    /// Steps per submission where others draw on the same device.
-    pace: Option<AtomicUsize>,
+    /// Where others draw on the same device.
+    turns: Option<Turns>,
+}
+
+/// Small submissions, of which two are under way.
+struct Turns {
+    /// Steps of the next.
+    steps: AtomicUsize,
+    /// The last, when it was made, and its steps.
+    last: Mutex<Option<(wgpu::SubmissionIndex, Instant, usize)>>,
 }
 
 /// Some rows of an image in a buffer, as a dispatch sees them.
@@ -54,8 +63,12 @@ pub struct Rows<'a> {
 /// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
 /// alignment that every adapter accepts.
 const ROW_STEP: usize = 64;
-/// Longest submission on a device on which others draw: what is left of a sixtieth of a second when they have drawn.
-const TURN: Duration = Duration::from_millis(10);
+/// Length of a submission on a device on which others draw. Two are under way at a time, so that the device does not wait for the host.
+const TURN: Duration = Duration::from_millis(15);
+/// Steps of a submission at least, however long it seems to take: on a busy machine most of that is waiting for a processor.
+const FEWEST: usize = 24;
+/// Beyond this it is the steps themselves that take long.
+const LONG: Duration = Duration::from_millis(250);
 /// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 4e8 pixels times taps per second; 0.4 s.
 const BUDGET_CPU: f64 = 1.5e8;
 /// Of a GPU: the slowest integrated ones make about 2e10; 50 ms.
@@ -142,13 +155,13 @@ impl Gpu {
         let limits = device.limits();
         let binding_limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let description = describe(&info);
-        Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0), pace: None }
+        Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0), turns: None }
     }
 
-    /// A device that others draw on as well. Work is submitted in small turns, each awaited before the next, so that what they draw
+    /// A device that others draw on as well. Work is submitted in small turns, two at a time, so that what they draw
     /// comes in between; results are those of [`Gpu::new`].
     pub fn shared(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Self {
-        Self { pace: Some(AtomicUsize::new(1)), ..Self::on(adapter, device, queue) }
+        Self { turns: Some(Turns { steps: AtomicUsize::new(FEWEST), last: Mutex::new(None) }), ..Self::on(adapter, device, queue) }
     }
 
     /// The same with `bytes` of memory for planes at most, as on an adapter that has no more.
@@ -266,7 +279,7 @@ impl Gpu {
         for run in steps.chunk_by(|a, b| matches!(a, Step::Upload(..)) == matches!(b, Step::Upload(..))) {
             let mut rest = run;
             while !rest.is_empty() {
-                let (part, later) = rest.split_at(self.pace.as_ref().map_or(1024, |p| p.load(Ordering::Relaxed)).min(rest.len()));
+                let (part, later) = rest.split_at(self.turns.as_ref().map_or(1024, |t| t.steps.load(Ordering::Relaxed)).min(rest.len()));
                 rest = later;
                 let mut encoder = self.device.create_command_encoder(&Default::default());
                 kernel::record(part, &mut encoder);
@@ -275,21 +288,24 @@ impl Gpu {
                         self.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
                     }
                 }
-                let start = Instant::now();
                 let index = self.queue.submit([encoder.finish()]);
-                if let Some(pace) = &self.pace {
-                    self.end_turn(pace, part.len(), index, start);
+                if let Some(turns) = &self.turns {
+                    self.next_turn(turns, part.len(), index);
                 }
             }
         }
     }
 
-    /// Waits for a turn and makes the next as long as it should have been.
-    fn end_turn(&self, pace: &AtomicUsize, steps: usize, index: wgpu::SubmissionIndex, start: Instant) {
+    /// Waits for the turn before the one that was just submitted, and makes the next as long as a turn should be.
+    fn next_turn(&self, turns: &Turns, steps: usize, index: wgpu::SubmissionIndex) {
+        let mut last = turns.last.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let before = last.replace((index, Instant::now(), steps));
+        let Some((index, start, steps)) = before else { return };
         // A device that does not answer is noticed, and told, where results are read.
         let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
-        let fits = (steps as f64 * TURN.as_secs_f64() / start.elapsed().as_secs_f64().max(1e-6)) as usize;
-        let now = pace.load(Ordering::Relaxed);
-        pace.store(fits.clamp(now / 2, 2 * now).clamp(1, 1024), Ordering::Relaxed);
+        let took = start.elapsed();
+        let fits = (steps as f64 * TURN.as_secs_f64() / took.as_secs_f64().max(1e-6)) as usize;
+        let (now, fewest) = (turns.steps.load(Ordering::Relaxed), if took > LONG { 1 } else { FEWEST });
+        turns.steps.store(fits.clamp(now / 2, 2 * now).clamp(fewest, 1024), Ordering::Relaxed);
     }
 }

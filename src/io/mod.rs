@@ -18,6 +18,7 @@ pub mod picture;
 pub mod raw;
 
 use crate::error::{Error, Result};
+#[cfg(feature = "raw")]
 use crate::image::{Plane, Rgb};
 use std::path::Path;
 

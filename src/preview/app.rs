@@ -659,7 +659,7 @@ impl App {
     pub(super) fn source_name(&self, source: Source) -> String {
         match source {
             Source::Merge => "Plain merge".into(),
-            Source::Result if self.solved.is_none() => "Plain merge (not solved yet)".into(),
+            Source::Result if self.solved.is_none() && self.estimate.is_none() => "Plain merge (not solved yet)".into(),
             Source::Result => {
                 let (w, full) = (self.solved.as_ref().map_or(0, |s| s.bracket.size().0), self.size().map_or(0, |s| s.x as usize));
                 let now = self.estimate.as_ref().map_or(w, |e| e.width);

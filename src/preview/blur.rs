@@ -235,14 +235,11 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
                 shade(inner);
                 painter.image(p.texture.id(), inner, uv, Color32::WHITE);
             }
-            let text = format!("{:.1} px", p.extent);
-            painter.text(
-                place.left_bottom() + Vec2::new(4.0, -3.0),
-                egui::Align2::LEFT_BOTTOM,
-                text,
-                egui::FontId::proportional(11.0),
-                colour,
-            );
+            // A number only where it fits.
+            if place.width() > 48.0 {
+                let (text, font) = (format!("{:.1} px", p.extent), egui::FontId::proportional(11.0));
+                painter.text(place.left_bottom() + Vec2::new(4.0, -3.0), egui::Align2::LEFT_BOTTOM, text, font, colour);
+            }
         }
         let hovered = response.hover_pos().and_then(|at| grasped(app, layout, at));
         for (i, p) in app.session.patches.iter().enumerate() {
@@ -385,7 +382,7 @@ fn plot(app: &mut App, ui: &mut egui::Ui, tsf: &Tsf, scale: f64) {
         let (x, y, z) = ((v[0] / pixels) as f32, (v[1] / pixels) as f32, (v[2] / degrees) as f32);
         let (u, depth) = (x * yaw.cos() - y * yaw.sin(), x * yaw.sin() + y * yaw.cos());
         let v = z * pitch.cos() - depth * pitch.sin();
-        rect.center() + Vec2::new(u, -v) * 0.29 * side
+        rect.center() + Vec2::new(u, -v) * 0.23 * side
     };
     let (p, d) = (pixels, degrees);
     let weak = Stroke::new(1.0, ui.visuals().weak_text_color().gamma_multiply(0.45));

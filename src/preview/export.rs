@@ -94,51 +94,57 @@ pub fn arguments(app: &App) -> Vec<OsString> {
 /// The window for exports.
 pub fn window(app: &mut App, ctx: &egui::Context) {
     let mut open = app.form.open;
-    egui::Window::new("Export").open(&mut open).resizable(false).collapsible(false).default_width(420.0).show(ctx, |ui| {
-        ui.horizontal(|ui| {
-            let label = ui.label("Linear result");
-            ui.add(egui::TextEdit::singleline(&mut app.form.path).desired_width(240.0)).labelled_by(label.id);
-            if ui.button("Browse...").clicked() {
-                ask_target(app);
+    egui::Window::new("Export").open(&mut open).resizable(false).collapsible(false).default_width(420.0).default_pos([120.0, 90.0]).show(
+        ctx,
+        |ui| {
+            ui.horizontal(|ui| {
+                let label = ui.label("Linear result");
+                ui.add(egui::TextEdit::singleline(&mut app.form.path).desired_width(240.0)).labelled_by(label.id);
+                if ui.button("Browse...").clicked() {
+                    ask_target(app);
+                }
+            });
+            ui.label(RichText::new("OpenEXR, TIFF or Radiance HDR, by the ending: .exr, .tif, .hdr").small().weak());
+            ui.checkbox(&mut app.form.picture, "Picture as shown (PNG)");
+            ui.checkbox(&mut app.form.report, "Report (JSON)");
+            ui.checkbox(&mut app.form.page, "Report page (HTML)");
+            ui.checkbox(&mut app.form.half, "16 bits instead of 32");
+            ui.checkbox(&mut app.form.overwrite, "Replace files that exist");
+            let ending = output::ending(Path::new(&app.form.path));
+            let known = ["exr", "tif", "tiff", "hdr"].contains(&ending.as_str());
+            let able = app.is_final() && known && !app.form.busy;
+            ui.horizontal(|ui| {
+                if ui.add_enabled(able, egui::Button::new("Write the files")).clicked()
+                    && let Some(solved) = app.solved.clone()
+                {
+                    app.form.busy = true;
+                    app.form.last = None;
+                    app.workers.write(app.program.clone(), arguments(app), solved);
+                }
+                if ui.button("Copy command line").clicked() {
+                    ui.ctx().copy_text(app.session.command_line(&app.noted(), Path::new(&app.form.path)));
+                }
+                if ui.button("Copy configuration").clicked() {
+                    ui.ctx().copy_text(app.session.configuration(&app.noted()));
+                }
+            });
+            if !known {
+                ui.label(RichText::new("Name the file with .exr, .tif or .hdr at its end").color(ui.visuals().warn_fg_color));
+            } else if !app.is_final() {
+                let text = if app.is_busy() {
+                    "The solution of this size and these settings is not there yet"
+                } else {
+                    "Solve first (Ctrl+Enter)"
+                };
+                ui.label(RichText::new(text).color(ui.visuals().warn_fg_color));
             }
-        });
-        ui.label(RichText::new("OpenEXR, TIFF or Radiance HDR, by the ending: .exr, .tif, .hdr").small().weak());
-        ui.checkbox(&mut app.form.picture, "Picture as shown (PNG)");
-        ui.checkbox(&mut app.form.report, "Report (JSON)");
-        ui.checkbox(&mut app.form.page, "Report page (HTML)");
-        ui.checkbox(&mut app.form.half, "16 bits instead of 32");
-        ui.checkbox(&mut app.form.overwrite, "Replace files that exist");
-        let ending = output::ending(Path::new(&app.form.path));
-        let known = ["exr", "tif", "tiff", "hdr"].contains(&ending.as_str());
-        let able = app.is_final() && known && !app.form.busy;
-        ui.horizontal(|ui| {
-            if ui.add_enabled(able, egui::Button::new("Write the files")).clicked()
-                && let Some(solved) = app.solved.clone()
-            {
-                app.form.busy = true;
-                app.form.last = None;
-                app.workers.write(app.program.clone(), arguments(app), solved);
+            match &app.form.last {
+                Some(Ok(text)) => drop(ui.label(text)),
+                Some(Err(text)) => drop(ui.label(RichText::new(text).color(ui.visuals().error_fg_color))),
+                None if app.form.busy => drop(ui.label("Writing ...")),
+                None => {}
             }
-            if ui.button("Copy command line").clicked() {
-                ui.ctx().copy_text(app.session.command_line(&app.noted(), Path::new(&app.form.path)));
-            }
-            if ui.button("Copy configuration").clicked() {
-                ui.ctx().copy_text(app.session.configuration(&app.noted()));
-            }
-        });
-        if !known {
-            ui.label(RichText::new("Name the file with .exr, .tif or .hdr at its end").color(ui.visuals().warn_fg_color));
-        } else if !app.is_final() {
-            let text =
-                if app.is_busy() { "The solution of this size and these settings is not there yet" } else { "Solve first (Ctrl+Enter)" };
-            ui.label(RichText::new(text).color(ui.visuals().warn_fg_color));
-        }
-        match &app.form.last {
-            Some(Ok(text)) => drop(ui.label(text)),
-            Some(Err(text)) => drop(ui.label(RichText::new(text).color(ui.visuals().error_fg_color))),
-            None if app.form.busy => drop(ui.label("Writing ...")),
-            None => {}
-        }
-    });
+        },
+    );
     app.form.open = open && app.form.open;
 }
