@@ -90,6 +90,13 @@ pub struct Outcome {
     pub reference: usize,
     /// Names of frames that the program, not the user, left out, and why.
     pub left_out: Vec<(String, String)>,
+    /// Why the result is less than was asked for, a sentence each: frames that had to be left out, and a merge where nothing could be
+    /// deblurred. Empty where all is as it should be.
+    pub degraded: Vec<String>,
+    /// Each frame's place: the motion from the reference frame, centred pixels; of shaken frames that of their mean pose.
+    pub places: Vec<DMat3>,
+    /// Masks m by which the frames counted, eq. (8), each on its own pixels.
+    pub masks: Vec<Plane>,
     /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
     pub misfit: Vec<Option<Plane>>,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
@@ -129,6 +136,7 @@ struct Run<'a> {
     motions: Vec<DMat3>,
     registrations: Vec<Registration>,
     left_out: Vec<(String, String)>,
+    degraded: Vec<String>,
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
     blind: Value,
@@ -168,6 +176,7 @@ pub fn merge(
         motions,
         registrations: vec![Registration::skipped(); frames.len()],
         left_out: Vec::new(),
+        degraded: Vec::new(),
         events,
         timings: Vec::new(),
         blind: Value::Null,
@@ -209,6 +218,12 @@ impl Run<'_> {
         if (self.events)(Event::Warning(text)) { Ok(()) } else { Err(Error::Cancelled) }
     }
 
+    /// A warning of a result that is less than was asked for.
+    fn degrade(&mut self, text: String) -> Result<()> {
+        self.degraded.push(text.clone());
+        self.warn(text)
+    }
+
     fn timed<T>(&mut self, what: &str, f: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
         let start = Instant::now();
         let out = f(self)?;
@@ -219,7 +234,7 @@ impl Run<'_> {
     /// A frame is left out because of what was found about it.
     fn leave_out(&mut self, i: usize, why: &str) -> Result<()> {
         let name = self.bracket.frames()[i].name.clone();
-        self.warn(format!("{name}: {why}; it is left out"))?;
+        self.degrade(format!("{name}: {why}; it is left out"))?;
         self.left_out.push((name, why.into()));
         Ok(())
     }
@@ -327,7 +342,7 @@ impl Run<'_> {
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
-            self.warn("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
+            self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || (!all_known && !sharp.contains(&true)) {
             match self.timed("all blurs", |run| run.joint(&used, 0.03, 0.60))? {
                 Some(found) => {
@@ -658,6 +673,7 @@ impl Run<'_> {
             "noise": self.noise,
             "blind": blind,
             "frames": entries,
+            "degraded": self.degraded,
             "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,
             "timings_s": std::mem::take(&mut self.timings),
@@ -666,7 +682,9 @@ impl Run<'_> {
         for (&i, plane) in all.iter().zip(solution.misfit) {
             misfit[i] = Some(plane);
         }
-        Ok(Outcome { irradiance, reference, left_out: self.left_out, misfit, report })
+        let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
+        let Self { left_out, degraded, masks, .. } = self;
+        Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }
 }
 

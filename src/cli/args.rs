@@ -169,7 +169,7 @@ pub(super) struct PhotoArgs {
     /// Options from a TOML file [default: unshaken/config.toml in the user's configuration folder, where it exists]
     #[arg(long, value_name = "FILE.toml", help_heading = "Settings")]
     pub config: Option<PathBuf>,
-    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: fast, archive
+    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: archive, small
     #[arg(long, value_name = "NAME", help_heading = "Settings")]
     pub preset: Option<String>,
     /// Print the options that are in force, as a configuration file, and stop

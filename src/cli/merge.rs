@@ -72,7 +72,8 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         let stated = stated.filter(|_| linear || !jpeg && args.response.as_deref() != Some("auto"));
         let (stated_by, stated) = stated.map_or((None, None), |(what, response)| (Some(what), Some(response)));
         let by_file = given.is_none().then_some(stated_by).flatten();
-        let (response, mut origin) = super::response::choose(args, given.or(stated), &bracket, events)?;
+        let chosen = super::response::choose(args, given.or(stated), &bracket, events)?;
+        let (response, mut origin, mut degraded) = (chosen.response, chosen.report, chosen.degraded);
         if let Some(what) = by_file {
             origin["origin"] = json!(format!("stated by the files: {what}"));
         }
@@ -90,13 +91,17 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
         let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
         let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
-        let mut degraded = Vec::new();
+        // Means of squares of pixels have less noise than the pixels.
+        let squares = (divisor * divisor) as f64;
+        settings.noise = settings.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares });
+        let mut warnings = Vec::new();
         let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), &mut |event| {
             if let Event::Warning(text) = &event {
-                degraded.push(text.clone());
+                warnings.push(text.clone());
             }
             events(event)
         })?;
+        degraded.extend(outcome.degraded.iter().cloned());
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
 
         let reference = &bracket.frames()[outcome.reference];
@@ -125,7 +130,8 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         if let Some(report) = outcome.report.as_object_mut() {
             report.insert("response".into(), origin);
             report.insert("exposure_notes".into(), json!(notes));
-            report.insert("warnings".into(), json!(degraded));
+            report.insert("warnings".into(), json!(warnings));
+            report.insert("degraded".into(), json!(degraded));
             report.insert(
                 "colour".into(),
                 json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),
@@ -154,7 +160,8 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
                     outcome: &outcome,
                     display: &display,
                     to_display: colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries"), own),
-                    warnings: &degraded,
+                    warnings: &warnings,
+                    divisor,
                     settings: photo.listing(args),
                 };
                 staged.push(target.stage_text(&page.html())?);

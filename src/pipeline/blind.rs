@@ -125,7 +125,7 @@ impl Run<'_> {
             "held_out_chi_squared_of_merge": found.held_out_merge,
         });
         if !believed {
-            self.warn(format!(
+            self.degrade(format!(
                 "no frame is sharp, and camera shake explains the frames no better than a merge (residuals {joint:.1} against {alone:.1} \
                  times the noise): they are merged without deblurring, the least blurred weighted most"
             ))?;

@@ -55,7 +55,7 @@ const TABLE: &[(&str, &[&str])] = &[
     // Colours.
     ("colour", &["image"]),
     // What a result rests on.
-    ("layers", &["image", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
+    ("layers", &["image", "pose::nearest_pixel", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
@@ -93,7 +93,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "experiments",
             "colour",
             "layers",
-            "mask",
+            "merge::resampled",
             "io",
             "pipeline",
             "metrics",
