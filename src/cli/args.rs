@@ -103,7 +103,7 @@ pub(super) struct MergeArgs {
     /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
     pub patch: Vec<String>,
-    /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
+    /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
     /// Interpolation of the warps
@@ -163,6 +163,9 @@ pub(super) struct PhotoArgs {
     /// Tone mapping of --preview: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1 [default: filmic]
     #[arg(long, value_name = "OP[:NAME=V,...]", help_heading = "Result")]
     pub tonemap: Option<String>,
+    /// Give the JPEG of --preview a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long, help_heading = "Result")]
+    pub gain_map: bool,
     /// Write one page (HTML) that shows everything: before and after, frames, masks, blur, residuals, settings
     #[arg(long, value_name = "OUT.html", help_heading = "Result")]
     pub report_html: Option<PathBuf>,
@@ -188,6 +191,9 @@ pub(super) struct TonemapArgs {
     /// Operator: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1,saturation=0.9
     #[arg(long, value_name = "OP[:NAME=V,...]", default_value = "filmic")]
     pub tonemap: String,
+    /// Give the JPEG a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long)]
+    pub gain_map: bool,
     /// Quality of a JPEG, 1 to 100
     #[arg(long, value_name = "N", default_value_t = 92, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,

@@ -135,10 +135,17 @@ pub(super) fn find(paths: &[PathBuf], gap: f64) -> Grouping {
     out
 }
 
-/// Two folders may hold a file of one name.
+/// Two folders may hold a file of one name: their names tell them apart, then numbers.
 fn distinct_names(groups: &mut [Group]) {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    groups.iter().for_each(|g| *counts.entry(g.name.clone()).or_default() += 1);
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
     for group in groups {
+        if counts[&group.name] > 1
+            && let Some(folder) = group.frames[0].parent().and_then(Path::file_name)
+        {
+            group.name = format!("{}-{}", folder.to_string_lossy(), group.name);
+        }
         let n = seen.entry(group.name.clone()).or_default();
         *n += 1;
         if *n > 1 {

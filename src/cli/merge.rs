@@ -47,7 +47,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
                 noted.exposure_time = Some(frame.exposure_time);
             }
         }
-        let frames::Loaded { bracket, stated, to_xyz, metadata, notes } = loaded;
+        let frames::Loaded { bracket, stated, to_xyz, metadata, noise, notes } = loaded;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
@@ -91,6 +91,12 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
         let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
         let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
+        let noise_origin = match (settings.noise, noise) {
+            (Some(_), _) => "given",
+            (None, Some(_)) => "noted by the files",
+            (None, None) => "estimated from the frames",
+        };
+        settings.noise = settings.noise.or(noise);
         // Means of squares of pixels have less noise than the pixels.
         let squares = (divisor * divisor) as f64;
         settings.noise = settings.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares });
@@ -129,6 +135,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         }
         if let Some(report) = outcome.report.as_object_mut() {
             report.insert("response".into(), origin);
+            report.insert("noise_origin".into(), json!(noise_origin));
             report.insert("exposure_notes".into(), json!(notes));
             report.insert("warnings".into(), json!(warnings));
             report.insert("degraded".into(), json!(degraded));
@@ -151,7 +158,12 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         if targets.preview.is_some() || targets.page.is_some() {
             let display = in_primaries(Primaries::Rec709).0;
             if let Some(target) = &targets.preview {
-                staged.push(target.stage_picture(&photo.operator.apply(&display), JPEG_QUALITY, noted)?);
+                let picture = photo.operator.apply(&display);
+                staged.push(if args.photo.gain_map {
+                    target.stage_gain_map(&picture, &display, JPEG_QUALITY, noted)?
+                } else {
+                    target.stage_picture(&picture, JPEG_QUALITY, noted)?
+                });
             }
             if let Some(target) = &targets.page {
                 let page = page::Page {
@@ -228,8 +240,13 @@ impl PhotoSettings {
         if photo.tonemap.is_some() && args.preview.is_none() {
             return refuse("--tonemap", "is for the picture of --preview; name one");
         }
-        if let Some(path) = &args.preview {
-            check_picture_name("--preview", path)?;
+        match &args.preview {
+            Some(path) => {
+                check_picture_name("--preview", path)?;
+                check_gain_map(photo.gain_map, "--preview", path)?;
+            }
+            None if photo.gain_map => return refuse("--gain-map", "is for the picture of --preview; name one"),
+            None => {}
         }
         Ok(Self { white, primaries, operator })
     }
@@ -255,7 +272,7 @@ impl PhotoSettings {
             ("--layers".into(), set(args.photo.layers)),
             ("--tonemap".into(), self.operator.to_string()),
             ("--no-align".into(), set(args.no_align)),
-            ("--noise".into(), or(&args.noise, "estimated")),
+            ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
         ]
     }
@@ -267,6 +284,14 @@ pub(super) fn check_picture_name(option: &str, path: &Path) -> Result<(), Usage>
         "png" | "jpg" | "jpeg" => Ok(()),
         _ => Err(Usage(format!("{option}: {} ends with neither .png nor .jpg; name the format by the ending", path.display()))),
     }
+}
+
+/// Gain maps are for JPEG.
+pub(super) fn check_gain_map(asked: bool, option: &str, path: &Path) -> Result<(), Usage> {
+    if asked && !["jpg", "jpeg"].contains(&output::ending(path).as_str()) {
+        return Err(Usage(format!("--gain-map: only JPEG holds a gain map; name the picture of {option} .jpg")));
+    }
+    Ok(())
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {

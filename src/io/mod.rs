@@ -3,11 +3,12 @@
 //! * [`input`] reads a frame of any kind: [`ldr`] (PNG, JPEG, TIFF), `raw` (camera raw files, feature `raw`), [`exr`], Radiance HDR;
 //!   [`metadata`] what the camera noted, [`icc`] what an embedded profile says of its colours;
 //! * [`exif`] writes frames with their exposure time;
-//! * [`exr`] and [`picture`] write results, linear or for display;
+//! * [`exr`], [`picture`] and [`gainmap`] write results, linear or for display;
 //! * [`output`] writes every result beside its target and renames it, so that nothing is ever half-written.
 
 pub mod exif;
 pub mod exr;
+pub mod gainmap;
 pub mod icc;
 pub mod input;
 pub mod ldr;
