@@ -90,7 +90,13 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         settings.focal_px = settings.focal_px.map(|f| f / divisor as f64);
         settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
         let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
-        let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
+        let bracket = if divisor == 1 {
+            bracket
+        } else {
+            // The frames themselves are not needed any more: their memory is.
+            let whole = bracket;
+            crate::response::reduced(&whole, &response, divisor)?
+        };
         let noise_origin = match (settings.noise, noise) {
             (Some(_), _) => "given",
             (None, Some(_)) => "noted by the files",

@@ -227,7 +227,7 @@ fn a_configuration_holds_every_option_of_merge() {
         // One run's files and what is no option of the merge itself.
         .filter(|(name, _)| !["output", "config", "preset", "print-config", "help", "version", "quiet", "json"].contains(&name.as_str()))
         .collect();
-    assert!(options.len() > 30, "{options:?}");
+    assert!(options.len() > 25, "{options:?}");
     let print = |arguments: &[&str]| unshaken(dir.path(), &[&["merge", "--print-config"], arguments].concat());
     let empty = print(&["--config", "none"]).out;
     for (name, valued) in &options {
@@ -256,6 +256,12 @@ fn completions_and_the_manual_page_know_every_command() {
             assert!(said.out.replace("\\-", "-").contains(word), "{what} lacks {word}");
         }
     }
+    // bash takes its own and completes an option by it.
+    std::fs::write(dir.path().join("c.bash"), unshaken(dir.path(), &["generate", "bash"]).out).unwrap();
+    let script = "source ./c.bash && COMP_WORDS=(unshaken merge --prim) COMP_CWORD=2 && _unshaken unshaken --prim merge && echo ${COMPREPLY[@]}";
+    if let Ok(out) = Command::new("bash").args(["-c", script]).current_dir(dir.path()).output() {
+        assert_eq!(String::from_utf8_lossy(&out.stdout).trim(), "--primaries", "{}", String::from_utf8_lossy(&out.stderr));
+    }
     for command in ["merge", "batch"] {
         assert!(unshaken(dir.path(), &[command, "--help"]).out.contains("Examples:"), "{command}");
     }
@@ -276,6 +282,29 @@ fn voices_quiet_and_json() {
     assert_eq!(events.last().map(|e| (&e["event"], &e["output"])), Some((&Value::from("done"), &Value::from("j.exr"))));
     let failed = unshaken(dir.path(), &["merge", "--json", "-o", "j.exr", "photos/p1.jpg", "none.jpg"]);
     assert!(failed.code == Some(1) && failed.out.lines().last().unwrap().contains("\"event\":\"error\""), "{}", failed.out);
+}
+
+/// On a terminal a bar with the stage and the time left, which is gone at the end; elsewhere a line per stage.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_terminal_shows_a_bar_and_a_log_lines() {
+    let dir = album();
+    let line = "merge --overwrite --no-align --sharp 1,2 --response gamma:2.2 -o x.exr photos/p1.jpg photos/p2.jpg";
+    let plain = unshaken(dir.path(), &line.split(' ').collect::<Vec<_>>());
+    assert_eq!(plain.code, Some(0), "{}", plain.err);
+    assert!(plain.err.lines().any(|l| l == "merging the sharp frames") && !plain.err.contains('%'), "{}", plain.err);
+    // 'script' runs a command on a terminal of its own.
+    let command = format!("{} {line}", env!("CARGO_BIN_EXE_unshaken"));
+    let run = Command::new("script").args(["-qec", &command, "/dev/null"]).current_dir(dir.path()).stdin(Stdio::null()).output();
+    let Ok(out) = run else {
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), "SKIPPED a_terminal_shows_a_bar_and_a_log_lines: the command 'script' is not there");
+        return;
+    };
+    let shown = String::from_utf8_lossy(&out.stdout).into_owned();
+    assert_eq!(out.status.code(), Some(0), "{shown}");
+    assert!(shown.contains(" left  ") && shown.contains('%') && shown.contains("merging the sharp frames"), "{shown:?}");
+    assert!(shown.trim_end().lines().last().unwrap().contains("wrote x.exr"), "{shown:?}");
 }
 
 /// What the merge of a bracket says, and what of it makes a result less than it should be.
@@ -302,6 +331,22 @@ fn strict_counts_degraded_results_and_no_other_warning() {
     let (code, out, degraded) = merge(&["--no-align", "--sharp", "1,2", "--exposures", "1,2"]);
     assert_eq!((code, degraded.as_array().map(Vec::len)), (Some(3), Some(1)), "{out}");
     assert!(out.contains("\"degraded\":true") && out.contains("EV"), "{out}");
+    // The same among many: the batch is done, and says so by its code; also when it is all done already.
+    std::fs::write(
+        dir.path().join("m.toml"),
+        "[[bracket]]\nname = \"odd\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nexposures = \"1,2\"\nno-align = true\nsharp = [1, 2]\n",
+    )
+    .unwrap();
+    let batch = |more: &[&str]| {
+        let line = ["batch", "--manifest", "m.toml", "--output-dir", "out", "--response", "gamma:2.2"];
+        let said = unshaken(dir.path(), &[&line[..], more].concat());
+        (said.code, said.out)
+    };
+    let (code, out) = batch(&["--strict"]);
+    assert!(code == Some(3) && out.contains("degraded") && out.contains("1 degraded"), "{code:?} {out}");
+    let (code, out) = batch(&["--strict"]);
+    assert!(code == Some(3) && out.contains("skipped"), "{code:?} {out}");
+    assert_eq!(batch(&[]).0, Some(0));
     // No frame left to be sharp.
     let blurred = r#"{"frame":"NAME","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1},{"t_x":2,"t_y":0,"weight":1}]}"#;
     let both = ["p1.jpg", "p2.jpg"].map(|n| blurred.replace("NAME", n)).join(",");

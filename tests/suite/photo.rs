@@ -546,8 +546,8 @@ fn segments(jpeg: &[u8]) -> Vec<(u8, usize, Vec<u8>)> {
 fn gain_maps_give_back_the_highlights() {
     let dir = tempdir().unwrap();
     let image = {
-        // Three decades, coloured, smooth.
-        let lamp = Plane::from_fn(120, 90, |x, y| 0.05 + 40.0 * (-((x as f32 - 80.0).hypot(y as f32 - 40.0) / 14.0).powi(2)).exp());
+        // Two decades, coloured, smooth.
+        let lamp = Plane::from_fn(120, 90, |x, y| 0.5 + 40.0 * (-((x as f32 - 80.0).hypot(y as f32 - 40.0) / 14.0).powi(2)).exp());
         Rgb([lamp.clone(), lamp.map(|v| 0.8 * v), lamp.map(|v| 0.6 * v)])
     };
     let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
