@@ -99,7 +99,7 @@ impl Page<'_> {
                 return f.clone();
             }
             let everywhere = f.intensity.0[0].map(|_| 1.0);
-            Frame { intensity: merge::resampled(&f.intensity, &everywhere, place).0, ..f.clone() }
+            Frame { intensity: merge::resampled(&f.intensity, &everywhere, place, 0).0, ..f.clone() }
         });
         // Sizes and exposure times are those of a bracket.
         Bracket::new(frames.collect()).unwrap_or_else(|_| self.bracket.clone())
