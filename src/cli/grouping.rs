@@ -210,7 +210,8 @@ fn parse(text: &str) -> anyhow::Result<Vec<Group>> {
     }
     let mut groups: Vec<Group> = Vec::new();
     for entry in manifest.bracket {
-        let plain = !entry.name.is_empty() && !entry.name.starts_with('.') && !entry.name.contains(['/', '\\']) && !entry.name.contains('\0');
+        let plain =
+            !entry.name.is_empty() && !entry.name.starts_with('.') && !entry.name.contains(['/', '\\']) && !entry.name.contains('\0');
         if !plain {
             anyhow::bail!("{:?} cannot name a result; give a file name without folder and ending", entry.name);
         }

@@ -49,7 +49,11 @@ impl Page<'_> {
              <h1>{t}</h1>\n<p>{} x {} pixels{} from {} frames; reference frame {}. {}</p>",
             size.0,
             size.1,
-            if self.divisor > 1 { format!(" (the frames reduced to 1/{}; places and lengths are in its pixels)", self.divisor) } else { String::new() },
+            if self.divisor > 1 {
+                format!(" (the frames reduced to 1/{}; places and lengths are in its pixels)", self.divisor)
+            } else {
+                String::new()
+            },
             self.bracket.frames().len(),
             escaped(&self.bracket.frames()[self.outcome.reference].name),
             escaped(concat!("unshaken ", env!("CARGO_PKG_VERSION"))),

@@ -45,7 +45,8 @@ impl GainMap {
         let (w, h) = linear.size();
         let curve: Vec<f64> = (0..256).map(|i| crate::response::Response::Srgb.inverse(0, f64::from(i) / 255.0)).collect();
         let shown = |x: usize, y: usize| luminance(picture.get_pixel(x as u32, y as u32).0.map(|c| curve[usize::from(c)]));
-        let meant = |x: usize, y: usize| luminance(linear.pixel(y * w + x).map(|v| if v.is_finite() { f64::from(v.max(0.0)) } else { 0.0 }));
+        let meant =
+            |x: usize, y: usize| luminance(linear.pixel(y * w + x).map(|v| if v.is_finite() { f64::from(v.max(0.0)) } else { 0.0 }));
         let (mut sum, mut count) = (0.0, 0.0);
         for y in (0..h).step_by(SHRINK) {
             for x in (0..w).step_by(SHRINK) {
@@ -61,9 +62,8 @@ impl GainMap {
         let gain = |i: usize| {
             let (x0, y0) = (i % nw * SHRINK, i / nw * SHRINK);
             let square = (y0..(y0 + SHRINK).min(h)).flat_map(|y| (x0..(x0 + SHRINK).min(w)).map(move |x| (x, y)));
-            let (sum, n) = square.fold((0.0, 0.0), |(sum, n), (x, y)| {
-                (sum + ((meant(x, y) * unit + OFFSET) / (shown(x, y) + OFFSET)).log2(), n + 1.0)
-            });
+            let (sum, n) = square
+                .fold((0.0, 0.0), |(sum, n), (x, y)| (sum + ((meant(x, y) * unit + OFFSET) / (shown(x, y) + OFFSET)).log2(), n + 1.0));
             (sum / n).clamp(LEAST_STOPS, MOST_STOPS) as f32
         };
         let gains: Vec<f32> = (0..nw * nh).into_par_iter().map(gain).collect();

@@ -136,7 +136,8 @@ fn of(exif: &Exif) -> Metadata {
     let fraction = text(exif, Tag::SubSecTimeOriginal).filter(|s| s.bytes().all(|b| b.is_ascii_digit()));
     let below_sea = exif.get_field(Tag::GPSAltitudeRef, In::PRIMARY).and_then(|f| f.value.get_uint(0)) == Some(1);
     Metadata {
-        exposure_time: number(exif, Tag::ExposureTime).or_else(|| number(exif, Tag::ShutterSpeedValue).filter(|v| v.abs() <= 40.0).map(|v| (-v).exp2())),
+        exposure_time: number(exif, Tag::ExposureTime)
+            .or_else(|| number(exif, Tag::ShutterSpeedValue).filter(|v| v.abs() <= 40.0).map(|v| (-v).exp2())),
         f_number: positive(Tag::FNumber),
         // 65535 stands for a speed that does not fit.
         iso: positive(Tag::PhotographicSensitivity).filter(|v| *v < 65535.0).or_else(|| positive(Tag::ISOSpeed)),

@@ -232,7 +232,13 @@ fn a_configuration_holds_every_option_of_merge() {
     let empty = print(&["--config", "none"]).out;
     for (name, valued) in &options {
         assert!(empty.lines().any(|l| l.trim_start_matches("# ").starts_with(&format!("{name} = "))), "--print-config lacks {name}");
-        let value = if !valued { "true" } else if name == "interpolation" { "\"six-point\"" } else { "\"7\"" };
+        let value = if !valued {
+            "true"
+        } else if name == "interpolation" {
+            "\"six-point\""
+        } else {
+            "\"7\""
+        };
         std::fs::write(dir.path().join("c.toml"), format!("{name} = {value}\n")).unwrap();
         let said = print(&["--config", "c.toml"]);
         assert_eq!(said.code, Some(0), "{name}: {}", said.err);
@@ -258,7 +264,8 @@ fn completions_and_the_manual_page_know_every_command() {
     }
     // bash takes its own and completes an option by it.
     std::fs::write(dir.path().join("c.bash"), unshaken(dir.path(), &["generate", "bash"]).out).unwrap();
-    let script = "source ./c.bash && COMP_WORDS=(unshaken merge --prim) COMP_CWORD=2 && _unshaken unshaken --prim merge && echo ${COMPREPLY[@]}";
+    let script =
+        "source ./c.bash && COMP_WORDS=(unshaken merge --prim) COMP_CWORD=2 && _unshaken unshaken --prim merge && echo ${COMPREPLY[@]}";
     if let Ok(out) = Command::new("bash").args(["-c", script]).current_dir(dir.path()).output() {
         assert_eq!(String::from_utf8_lossy(&out.stdout).trim(), "--primaries", "{}", String::from_utf8_lossy(&out.stderr));
     }
@@ -320,9 +327,10 @@ fn strict_counts_degraded_results_and_no_other_warning() {
         (said.code, said.out, report["degraded"].clone())
     };
     // As asked, though something is said: a frame that the TSF file lacks, a frame that the user leaves out.
-    for (more, word) in
-        [(["--sharp", "1,2", "--tsf", "tsf.json"].as_slice(), "its TSF is estimated"), (&["--sharp", "1", "--exclude", "2"], "leaves one frame")]
-    {
+    for (more, word) in [
+        (["--sharp", "1,2", "--tsf", "tsf.json"].as_slice(), "its TSF is estimated"),
+        (&["--sharp", "1", "--exclude", "2"], "leaves one frame"),
+    ] {
         let (code, out, degraded) = merge(more);
         assert!(code == Some(0) && out.contains("\"warning\"") && out.contains(word), "{code:?} {out}");
         assert_eq!(degraded, serde_json::json!([]));
@@ -348,7 +356,8 @@ fn strict_counts_degraded_results_and_no_other_warning() {
     assert!(code == Some(3) && out.contains("skipped"), "{code:?} {out}");
     assert_eq!(batch(&[]).0, Some(0));
     // No frame left to be sharp.
-    let blurred = r#"{"frame":"NAME","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1},{"t_x":2,"t_y":0,"weight":1}]}"#;
+    let blurred =
+        r#"{"frame":"NAME","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1},{"t_x":2,"t_y":0,"weight":1}]}"#;
     let both = ["p1.jpg", "p2.jpg"].map(|n| blurred.replace("NAME", n)).join(",");
     std::fs::write(dir.path().join("tsf.json"), format!(r#"{{"format":"unshaken-tsf","version":1,"frames":[{both}]}}"#)).unwrap();
     let (code, out, _) = merge(&["--tsf", "tsf.json"]);
@@ -391,7 +400,10 @@ fn a_batch_that_was_killed_goes_on_where_it_was() {
     assert_eq!(said.code, Some(0), "{}{}", said.out, said.err);
     let status = |name: &str| {
         let events = said.out.lines().filter_map(|l| serde_json::from_str::<Value>(l).ok());
-        events.filter(|e| e["event"] == "bracket" && e["name"] == name).map(|e| e["status"].as_str().unwrap().to_string()).collect::<Vec<_>>()
+        events
+            .filter(|e| e["event"] == "bracket" && e["name"] == name)
+            .map(|e| e["status"].as_str().unwrap().to_string())
+            .collect::<Vec<_>>()
     };
     assert_eq!((status("one"), status("two")), (vec!["skipped".to_string()], vec!["done".to_string()]), "{}", said.out);
     assert!(std::fs::metadata(dir.path().join("out/two.exr")).unwrap().len() > 1000);

@@ -319,7 +319,9 @@ fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
     let off = log_difference(&image, &truth.map_planes(|p| p.map(|v| v * 0.125)), 1.0);
     assert!(off < 0.25, "log irradiance is off by {off:.3}");
     let page = std::fs::read_to_string(dir.path().join("first.html")).unwrap();
-    for part in ["3: frame3.png", "shaken, deblurred", "Local blur (PSF) at each patch", "Camera motion (TSF)", "roll, deg", "residual over noise"] {
+    for part in
+        ["3: frame3.png", "shaken, deblurred", "Local blur (PSF) at each patch", "Camera motion (TSF)", "roll, deg", "residual over noise"]
+    {
         assert!(page.contains(part), "the page lacks {part}");
     }
     let preview = image::open(dir.path().join("first.png")).unwrap().into_rgb8();

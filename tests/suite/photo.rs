@@ -500,10 +500,13 @@ fn layers_lie_on_the_pixels_of_the_result() {
     use unshaken::exposure::{Bracket, Frame};
     let (w, h) = (40, 30);
     // A lamp at (20, 10) of the scene, which the second frame shows five pixels further right and clips.
-    let frame = |name: &str, time: f64, at: usize| {
-        let plane = Plane::from_fn(w, h, |x, y| if x.abs_diff(at) < 3 && y.abs_diff(10) < 3 { (2.0 * time as f32).min(1.0) } else { 0.1 * time as f32 });
-        Frame { name: name.into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time: time }
-    };
+    let frame =
+        |name: &str, time: f64, at: usize| {
+            let plane = Plane::from_fn(w, h, |x, y| {
+                if x.abs_diff(at) < 3 && y.abs_diff(10) < 3 { (2.0 * time as f32).min(1.0) } else { 0.1 * time as f32 }
+            });
+            Frame { name: name.into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time: time }
+        };
     let bracket = Bracket::new(vec![frame("a", 0.25, 20), frame("b", 1.0, 25)]).unwrap();
     let shift = glam::DMat3::from_translation(glam::DVec2::new(5.0, 0.0));
     let outcome = unshaken::pipeline::Outcome {
@@ -518,7 +521,10 @@ fn layers_lie_on_the_pixels_of_the_result() {
     };
     let layers: std::collections::BTreeMap<String, Plane> =
         unshaken::layers::layers(&bracket, &Response::Linear, &outcome).into_iter().collect();
-    assert_eq!(layers.keys().map(String::as_str).collect::<Vec<_>>(), ["confidence.Y", "residual.Y", "saturation.Y", "weight.frame1", "weight.frame2"]);
+    assert_eq!(
+        layers.keys().map(String::as_str).collect::<Vec<_>>(),
+        ["confidence.Y", "residual.Y", "saturation.Y", "weight.frame1", "weight.frame2"]
+    );
     let at = |name: &str, x: usize| layers[name].at(x, 10);
     assert_eq!((at("saturation.Y", 20), at("saturation.Y", 25)), (0.5, 0.0), "where the lamp is in the result");
     assert_eq!((at("weight.frame1", 20), at("weight.frame2", 20)), (1.0, 0.0));
@@ -586,14 +592,16 @@ fn gain_maps_give_back_the_highlights() {
         f64::from(at(0)) / f64::from(at(4))
     };
     assert_eq!((iso.len(), iso[4]), (5 + 7 * 8, 0x40));
-    for (i, name) in ["HDRCapacityMin", "HDRCapacityMax", "GainMapMin", "GainMapMax", "Gamma", "OffsetSDR", "OffsetHDR"].iter().enumerate() {
+    for (i, name) in ["HDRCapacityMin", "HDRCapacityMax", "GainMapMin", "GainMapMax", "Gamma", "OffsetSDR", "OffsetHDR"].iter().enumerate()
+    {
         assert!((fraction(i) - value(name)).abs() < 2e-6, "{name}: {} and {}", fraction(i), value(name));
     }
     // ISO 21496-1, with all the headroom there is: (picture + offset) 2^gain - offset.
     let codes = image::load_from_memory(map).unwrap().into_luma8();
     assert_eq!(codes.dimensions(), (60, 45));
     let light = |x: u32, y: u32| {
-        let gain = value("GainMapMin") + (value("GainMapMax") - value("GainMapMin")) * f64::from(codes.get_pixel(x / 2, y / 2).0[0]) / 255.0;
+        let gain =
+            value("GainMapMin") + (value("GainMapMax") - value("GainMapMin")) * f64::from(codes.get_pixel(x / 2, y / 2).0[0]) / 255.0;
         let base = Response::Srgb.inverse(1, f64::from(picture.get_pixel(x, y).0[1]) / 255.0);
         (base + value("OffsetSDR")) * gain.exp2() - value("OffsetHDR")
     };

@@ -20,7 +20,16 @@ pub struct Notes {
 
 impl Default for Notes {
     fn default() -> Self {
-        Self { time: Some((1, 8)), f_number: Some((56, 10)), iso: Some(200), bias: None, taken: None, orientation: 1, artist: None, noise: None }
+        Self {
+            time: Some((1, 8)),
+            f_number: Some((56, 10)),
+            iso: Some(200),
+            bias: None,
+            taken: None,
+            orientation: 1,
+            artist: None,
+            noise: None,
+        }
     }
 }
 
@@ -129,7 +138,9 @@ pub fn dng(scene: &Rgb, notes: &Notes) -> Vec<u8> {
         (50778, short(&[21])),
     ];
     main.extend(notes.artist.map(|a| (315, text(a))));
-    main.extend(notes.noise.as_ref().map(|v| (51041, (12u16, v.len() as u32, v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()))));
+    main.extend(
+        notes.noise.as_ref().map(|v| (51041, (12u16, v.len() as u32, v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()))),
+    );
     main.sort_by_key(|t| t.0);
     type Entry = (u16, (u16, u32, Vec<u8>));
     let directory = |entries: &[Entry], at: u32| {
