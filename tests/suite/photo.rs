@@ -204,7 +204,7 @@ fn dates_are_seconds() {
     assert_eq!(seconds("1970:01:01 00:00:00"), Some(0.0));
     assert_eq!(seconds("2024:02:29 12:00:00.25"), Some(1_709_208_000.25));
     assert_eq!(seconds("2024:03:01 12:00:00").unwrap() - seconds("2024:02:29 12:00:00").unwrap(), 86400.0);
-    for wrong in ["", "0000:00:00 00:00:00", "2024:13:01 00:00:00", "yesterday noon", "2024:01:01"] {
+    for wrong in ["", "9223372036854775807:01:01 00:00:00", "0000:00:00 00:00:00", "2024:13:01 00:00:00", "yesterday noon", "2024:01:01"] {
         assert_eq!(seconds(wrong), None, "{wrong}");
     }
 }
@@ -283,6 +283,31 @@ fn linear_files_are_linear_frames() {
     let above = truth.0.iter().flat_map(|p| &p.data).filter(|v| **v > 1.0).count() as f64 / (3.0 * 40.0 * 30.0);
     assert!(above > 0.0 && (clipped - above).abs() < 1e-9);
     assert!(matches!(image::open(at("b.tif")).unwrap(), image::DynamicImage::ImageRgb16(_)));
+}
+
+/// Memory is asked for what a file can hold, not for what its header claims.
+#[test]
+fn headers_that_claim_more_than_their_files_hold_are_refused() {
+    let dir = tempdir().unwrap();
+    let refused = |name: &str, bytes: &[u8]| {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        for error in [input::read(&path, 1.0).err(), input::read_linear(&path).err()] {
+            let text = error.unwrap().to_string();
+            assert!(text.contains(name) && text.contains("claims") && text.contains("cannot hold"), "{text}");
+        }
+    };
+    refused("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n\x02\x02\xea\x60");
+    let path = dir.path().join("whole.exr");
+    let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
+    Output::check(&path, true).unwrap().stage_exr(&colours(24, 16), &radiometry).unwrap().commit().unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    for window in [b"dataWindow\0box2i\0\x10\0\0\0".as_slice(), b"displayWindow\0box2i\0\x10\0\0\0"] {
+        let at = bytes.windows(window.len()).position(|w| w == window).unwrap() + window.len();
+        bytes[at + 8..at + 12].copy_from_slice(&59_999i32.to_le_bytes());
+        bytes[at + 12..at + 16].copy_from_slice(&59_999i32.to_le_bytes());
+    }
+    refused("a.exr", &bytes);
 }
 
 #[test]
