@@ -5,7 +5,7 @@ use crate::colour::{self, Matrix};
 use crate::exposure::{Bracket, Frame};
 use crate::image::{Plane, Rgb};
 use crate::layers;
-use crate::merge;
+use crate::merge::resampled;
 use crate::pipeline::Outcome;
 use crate::response::Response;
 use crate::tonemap::ToneMap;
@@ -103,7 +103,7 @@ impl Page<'_> {
                 return f.clone();
             }
             let everywhere = f.intensity.0[0].map(|_| 1.0);
-            Frame { intensity: merge::resampled(&f.intensity, &everywhere, place, 0).0, ..f.clone() }
+            Frame { intensity: resampled(&f.intensity, &everywhere, place, 0).0, ..f.clone() }
         });
         // Sizes and exposure times are those of a bracket.
         Bracket::new(frames.collect()).unwrap_or_else(|_| self.bracket.clone())
