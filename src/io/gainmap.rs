@@ -57,7 +57,7 @@ impl GainMap {
                 }
             }
         }
-        let unit = if count > 0.0 { (sum / count as f64).exp() } else { 1.0 };
+        let unit = if count > 0.0 { (sum / count).exp() } else { 1.0 };
         let (nw, nh) = (w.div_ceil(SHRINK), h.div_ceil(SHRINK));
         let gain = |i: usize| {
             let (x0, y0) = (i % nw * SHRINK, i / nw * SHRINK);

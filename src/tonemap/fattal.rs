@@ -140,7 +140,7 @@ impl Cosines {
         plane.data.par_chunks_exact_mut(n).for_each_init(buffers, |(v, spectrum, scratch), row| {
             // The even samples, then the odd ones backwards.
             for (m, x) in row.iter().enumerate() {
-                v[if m % 2 == 0 { m / 2 } else { n - 1 - m / 2 }] = *x;
+                v[if m.is_multiple_of(2) { m / 2 } else { n - 1 - m / 2 }] = *x;
             }
             self.to.process_with_scratch(v, spectrum, scratch).expect("the buffers are the plan's own");
             for (k, (s, t)) in spectrum.iter().zip(&self.turn).enumerate() {
@@ -163,12 +163,12 @@ impl Cosines {
             }
             // Real but for rounding, which the transform refuses.
             spectrum[0].im = 0.0;
-            if n % 2 == 0 {
+            if n.is_multiple_of(2) {
                 spectrum[n / 2].im = 0.0;
             }
             self.from.process_with_scratch(spectrum, v, scratch).expect("the buffers are the plan's own, real where they must be");
             for (m, x) in row.iter_mut().enumerate() {
-                *x = v[if m % 2 == 0 { m / 2 } else { n - 1 - m / 2 }] / n as f32;
+                *x = v[if m.is_multiple_of(2) { m / 2 } else { n - 1 - m / 2 }] / n as f32;
             }
         });
     }
