@@ -162,6 +162,8 @@ fn of(exif: &Exif) -> Metadata {
             .fields()
             .filter(|f| f.ifd_num == In::PRIMARY && (CARRIED.contains(&f.tag) || f.tag.context() == exif::Context::Gps))
             .filter(|f| !matches!(&f.value, Value::Unknown(..)) && size(&f.value) <= MOST_BYTES)
+            // A tag that comes twice counts once, here as above.
+            .filter(|f| exif.get_field(f.tag, In::PRIMARY).is_some_and(|first| std::ptr::eq(first, *f)))
             .cloned()
             .collect(),
     }

@@ -198,6 +198,27 @@ fn png_with(exif: &[u8]) -> Vec<u8> {
     bytes
 }
 
+/// What cannot be read of a frame does not come out of its result as something else: here the first of two exposure times is no number.
+#[test]
+fn a_tag_that_comes_twice_is_carried_as_it_is_read() {
+    let time = |num, denom| exif::Field {
+        tag: exif::Tag::ExposureTime,
+        ifd_num: exif::In::PRIMARY,
+        value: exif::Value::Rational(vec![exif::Rational { num, denom }]),
+    };
+    let (nonsense, other) = (time(0, 0), time(20, 1));
+    let mut writer = exif::experimental::Writer::new();
+    writer.push_field(&nonsense);
+    writer.push_field(&other);
+    let mut block = std::io::Cursor::new(Vec::new());
+    writer.write(&mut block, false).unwrap();
+    let noted = metadata::read_bytes(block.get_ref());
+    let again = metadata::read_bytes(&noted.exif_block().unwrap());
+    assert_eq!(noted.exposure_time, again.exposure_time);
+    let exif = exif::Reader::new().read_raw(noted.exif_block().unwrap()).unwrap();
+    assert_eq!(exif.fields().filter(|f| f.tag == exif::Tag::ExposureTime).count(), 1);
+}
+
 #[test]
 fn dates_are_seconds() {
     let seconds = |t: &str| metadata::seconds(t);
