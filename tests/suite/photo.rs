@@ -319,6 +319,14 @@ fn headers_that_claim_more_than_their_files_hold_are_refused() {
         }
     };
     refused("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n\x02\x02\xea\x60");
+    // A JPEG that never ends a line costs little: 759 bytes claimed 100 million pixels.
+    photos::write_jpeg(&dir.path().join("whole.jpg"), &image::RgbImage::new(24, 16), &Notes::default());
+    let mut bytes = std::fs::read(dir.path().join("whole.jpg")).unwrap();
+    let at = bytes.windows(2).position(|w| w == [0xFF, 0xC0]).unwrap();
+    bytes[at + 5..at + 9].copy_from_slice(&[0x20, 0, 0x30, 0]);
+    std::fs::write(dir.path().join("a.jpg"), &bytes).unwrap();
+    let text = input::read(&dir.path().join("a.jpg"), 1.0).unwrap_err().to_string();
+    assert!(text.contains("a.jpg") && text.contains("claims 12288 x 8192 pixels"), "{text}");
     let path = dir.path().join("whole.exr");
     let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
     Output::check(&path, true).unwrap().stage_exr(&colours(24, 16), &radiometry).unwrap().commit().unwrap();
