@@ -340,13 +340,15 @@ impl Run<'_> {
         // Where no frame shows the scene: what to start from instead.
         let mut scene: Option<Rgb> = None;
         let mut centre: Option<usize> = None;
-        let forced = self.settings.blind == Blind::Joint && given.is_none();
+        let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
+        let doubtful =
+            given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto && blind::doubtful(&verdicts, &sharp);
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
             self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
-        } else if forced || (!all_known && !sharp.contains(&true)) {
-            match self.timed("all blurs", |run| run.joint(&used, 0.03, 0.60))? {
+        } else if forced || doubtful || (!all_known && !sharp.contains(&true)) {
+            match self.timed("all blurs", |run| run.all_blurs(&used, doubtful, 0.03, 0.60))? {
                 Some(found) => {
                     scene = Some(found.start);
                     centre = Some(found.reference);
@@ -355,7 +357,7 @@ impl Run<'_> {
                         tsfs[i] = Some(tsf);
                     }
                 }
-                None => unexplained = true,
+                None => unexplained = !doubtful,
             }
         } else if !sharp.contains(&true) {
             scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);

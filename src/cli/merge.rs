@@ -356,11 +356,12 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         None => Blind::default(),
         Some("auto") => Blind::Auto,
         Some("joint") => Blind::Joint,
+        Some("patches") => Blind::Patches,
         Some("off") => Blind::Off,
-        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint nor off"))),
+        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint, patches nor off"))),
     };
-    if settings.blind == Blind::Joint && args.tsf.is_some() {
-        return Err(Usage("--blind joint estimates the TSFs that --tsf gives; leave one of them out".into()));
+    if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {
+        return Err(Usage(format!("--blind {word} estimates the TSFs that --tsf gives; leave one of them out")));
     }
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {

@@ -23,7 +23,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
-    ("blind", &["image", "merge", "pose", "tsf"]),
+    ("blind", &["image", "merge", "pose", "psf", "tsf"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
