@@ -107,6 +107,8 @@ const HOPELESS: f64 = 8.0;
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 3;
+/// The same where frames are displaced: the start was resampled, which smooths, and the residual-driven weights come late.
+const DISPLACED_OUTER: usize = 8;
 /// Outer iterations of the rounds before the last.
 const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
@@ -368,16 +370,19 @@ impl Run<'_> {
         // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
         let start_frames = if still.is_empty() { shaken.clone() } else { still.clone() };
         self.progress("merging the sharp frames", 0.03)?;
-        let initial = self.start(&start_frames);
+        let (initial, _) = self.start(&start_frames, 0);
         for &i in &still {
             tsfs[i] = Some(Tsf::still(self.motions[i]));
         }
-        // Without blur an iteration costs next to nothing: this solution may converge.
-        let alone = deblur::Settings { outer: SHARP_OUTER, ..self.settings.deblur.clone() };
-        let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
         let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
+        // Without blur an iteration costs next to nothing: this solution may converge.
+        let alone = deblur::Settings {
+            outer: if start_frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { DISPLACED_OUTER } else { SHARP_OUTER },
+            ..self.settings.deblur.clone()
+        };
+        let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
-        let initial = initial.map_planes(|p| p.padded(pad));
+        let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
         let base = self.timed("sharp frames", |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.05, 0.10))?;
         let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
@@ -411,8 +416,11 @@ impl Run<'_> {
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
             let pad = deblur::pad_for(&known, w, h, limit);
             let from = match (&solution, &scene) {
-                (None, Some(scene)) => scene.map_planes(|p| p.padded(pad)),
-                (found, _) => found.as_ref().unwrap_or(&base).with_pad(pad),
+                (None, Some(scene)) => self.surrounded(scene, 0, pad, &still, &shaken),
+                (found, _) => {
+                    let found = found.as_ref().unwrap_or(&base);
+                    self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken)
+                }
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
@@ -483,20 +491,41 @@ impl Run<'_> {
         Ok(solved)
     }
 
-    /// Merge of the frames `ids` on the reference's grid, to start from.
-    fn start(&self, ids: &[usize]) -> Rgb {
-        if ids.iter().all(|&i| self.motions[i] == DMat3::IDENTITY) {
-            return merge::irradiance(self.bracket, &self.exposures, &self.masks, &self.curves, ids);
-        }
+    /// Merge of the frames `ids`, placed but not deblurred, on the reference's grid plus `pad` pixels on every side, and where any of
+    /// them is not masked.
+    fn start(&self, ids: &[usize], pad: usize) -> (Rgb, Plane) {
         let seen = (0..self.exposures.len()).map(|i| {
-            if ids.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i])
+            if ids.contains(&i) && (pad > 0 || self.motions[i] != DMat3::IDENTITY) {
+                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i], pad)
             } else {
                 (self.exposures[i].clone(), self.masks[i].clone())
             }
         });
         let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = seen.unzip();
-        merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids)
+        let merged = merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids);
+        let (w, h) = merged.size();
+        (merged, Plane::from_fn(w, h, |x, y| ids.iter().map(|&i| masks[i].data[y * w + x]).fold(0.0, f32::max)))
+    }
+
+    /// `image`, which lies on the reference's grid plus `own` pixels on every side, on that plus `pad` pixels. What it lacks is what
+    /// the frames show that see it: the sharp ones, where none the others; and beyond all of them the nearest pixel.
+    fn surrounded(&self, image: &Rgb, own: usize, pad: usize, still: &[usize], shaken: &[usize]) -> Rgb {
+        let (w, h) = self.bracket.size();
+        let nearest = |x: usize, y: usize| ((x + own) as isize - pad as isize, (y + own) as isize - pad as isize);
+        let displaced = |ids: &[usize]| -> Option<(Rgb, Plane)> {
+            let moved = ids.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+            (pad > own && moved).then(|| self.start(ids, pad))
+        };
+        let around = [displaced(still), displaced(shaken)];
+        let within = |a: isize, n: usize| a >= 0 && (a as usize) < n + 2 * own;
+        Rgb(std::array::from_fn(|c| {
+            Plane::from_fn(w + 2 * pad, h + 2 * pad, |x, y| {
+                let (i, j) = nearest(x, y);
+                let beyond = !(within(i, w) && within(j, h));
+                let other = around.iter().flatten().find(|(_, seen)| beyond && seen.data[y * seen.width + x] > 0.0);
+                other.map_or_else(|| image.0[c].clamped(i, j), |(shown, seen)| shown.0[c].data[y * seen.width + x])
+            })
+        }))
     }
 
     /// Mean squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred.
@@ -505,7 +534,7 @@ impl Run<'_> {
         let (seen, inside) = if self.motions[i] == DMat3::IDENTITY {
             (latent.clone(), mask.clone())
         } else {
-            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse())
+            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse(), 0)
         };
         let mask = mask.zip(&inside, |m, k| m * k);
         merge::misfit(&seen, exposure, &mask, &self.curves[i], self.bracket.frames()[i].exposure_time)
@@ -598,7 +627,7 @@ impl Run<'_> {
         if *motion == DMat3::IDENTITY {
             return (latent.mean(), everywhere);
         }
-        let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse());
+        let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse(), 0);
         (seen.mean(), inside)
     }
 

@@ -58,7 +58,7 @@ impl Run<'_> {
     fn aligned(&self, used: &[usize], masks: &[Plane]) -> (Vec<Rgb>, Vec<Plane>) {
         let seen = (0..masks.len()).map(|i| {
             if used.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i])
+                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], 0)
             } else {
                 (self.exposures[i].clone(), masks[i].clone())
             }

@@ -73,7 +73,7 @@ impl Tsf {
 
     /// Whether the frame is the latent scene itself (single pose, nothing moves).
     pub fn is_identity(&self) -> bool {
-        self.base == DMat3::IDENTITY && matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
+        self.base.abs_diff_eq(DMat3::IDENTITY, 1e-9) && matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
     }
 
     /// Where the frame of a single pose lies (frame from reference, centred pixels); `None` for a blurred frame.
