@@ -152,7 +152,7 @@ pub(super) fn photographs(lab: &mut Lab, all_shaken: bool, events: Events) -> Re
         title: if all_shaken { "Figure 9: photographs, all blurred" } else { "Figure 8: photographs, the longest blurred" }.into(),
         text: format!(
             "Scene {}, {}; the camera mostly turns (pitch, yaw and roll){}. The paper's photographs are not published; these frames go through what a \
-             camera does to them, and the program is told nothing but the exposure times.{}",
+             camera does to them, and the program knows the exposure times and that curve.{}",
             drawn.name(),
             study.camera,
             if all_shaken { "" } else { ", and every frame lies up to a hundredth of its width off" },
