@@ -548,6 +548,8 @@ fn wrong_synth_compare_and_baseline_options_are_refused() {
         ("compare --no-reference text.png", 1, &["text.png", "not a picture"]),
         ("compare --no-reference a.png", 1, &["a.png", "64 pixels"]),
         ("experiment fig99 --output-dir other", 2, &["fig99", "fig5", "sharpness"]),
+        ("experiment office --output-dir other", 2, &["office", "--photographs"]),
+        ("experiment office --photographs nowhere --output-dir other", 1, &["nowhere", "--photographs"]),
         ("baseline --output-dir other --method tripod --exposures 1,2 a.png b.png", 2, &["--tripod", "0 tripod frames for 2 frames"]),
         ("baseline --output-dir other --method mertens,mertens --exposures 1,2 a.png b.png", 2, &["--method", "named twice"]),
     ]);
