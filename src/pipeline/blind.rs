@@ -123,7 +123,7 @@ impl Run<'_> {
             Ok(found) => found,
             Err(Lack::Cancelled) => return Err(Error::Cancelled),
             Err(Lack::Texture(k)) => {
-                self.warn(format!(
+                self.degrade(format!(
                     "{}: shares no patch of enough texture with {}, unclipped in both, to find its blur; the frames are merged without \
                      deblurring (--blind joint may find more)",
                     name(k),
