@@ -28,6 +28,7 @@ pub enum Blind {
 }
 
 /// Irradiance to start from and one TSF for each of the frames used.
+#[derive(Clone)]
 pub(super) struct Found {
     pub start: Rgb,
     pub tsfs: Vec<Tsf>,
