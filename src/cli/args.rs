@@ -51,6 +51,9 @@ pub(super) enum Command {
     Adapters,
     /// Make a picture for the screen from a linear image
     Tonemap(TonemapArgs),
+    /// Open a window: see a bracket, nudge it, export it
+    #[cfg(feature = "preview")]
+    Preview(super::preview::PreviewArgs),
     /// Find the brackets among many photographs and merge each
     Batch(BatchArgs),
     /// Print the completions of a shell, or the manual page
@@ -103,14 +106,23 @@ pub(super) struct MergeArgs {
     /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
     pub patch: Vec<String>,
+    /// Largest reach in pixels of the local blurs (PSFs) that the report shows [default: as far as the camera's motion takes the place]
+    #[arg(long, value_name = "R", allow_hyphen_values = true)]
+    pub psf_radius: Option<String>,
+    /// Weight of the smoothness (total variation of log irradiance): more is smoother and less noisy [default: 2.5]
+    #[arg(long, value_name = "L", allow_hyphen_values = true)]
+    pub lambda: Option<String>,
+    /// How much a shaken frame loses weight where its blur does not explain it: 0 (trusted everywhere) and more [default: 1]
+    #[arg(long, value_name = "C", allow_hyphen_values = true)]
+    pub robust: Option<String>,
     /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
     /// Interpolation of the warps
     #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
     pub interpolation: String,
-    /// When no frame is sharp: auto (all blurs and the scene together), joint (so even if a frame passes for sharp), off (merge only) [default: off]
-    #[arg(long, value_name = "auto|joint|off")]
+    /// When no frame is sharp: auto (all blurs and the scene together; also when no frame is surely sharp), joint (so even if a frame passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: off]
+    #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]

@@ -1,6 +1,8 @@
 //! Transformation spread functions (section II-B): which poses the camera went through and for how long.
 
 mod active_set;
+mod align_across;
+mod align_within;
 mod continuous;
 mod estimate;
 mod from_psfs;
@@ -8,6 +10,8 @@ mod model;
 mod taps;
 mod whole_frame;
 
+pub use align_across::{align_across, blurred};
+pub use align_within::{Within, align_within, psf_at, shifted};
 pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
 pub use model::Model;

@@ -133,7 +133,8 @@ fn wrong_options_are_usage_errors() {
         ),
         ("merge -o x.exr --exposures 1,2 --focal-px 0 a.png b.png", 2, &["--focal-px", "positive"]),
         ("merge -o x.exr --exposures 1,2 --patch 12 a.png b.png", 2, &["--patch", "120,80"]),
-        ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint nor off"]),
+        ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint, patches nor off"]),
+        ("merge -o x.exr --exposures 1,2 --blind patches --tsf tsf.json a.png b.png", 2, &["--blind patches", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --blind joint --tsf tsf.json a.png b.png", 2, &["--blind joint", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --alpha 1.5 a.png b.png", 2, &["--alpha", "from 0 to 1"]),
         ("merge -o x.exr --exposures 1,2 --noise 4000 a.png b.png", 2, &["--noise", "\"4000\"", "12000,6"]),
@@ -547,6 +548,8 @@ fn wrong_synth_compare_and_baseline_options_are_refused() {
         ("compare --no-reference text.png", 1, &["text.png", "not a picture"]),
         ("compare --no-reference a.png", 1, &["a.png", "64 pixels"]),
         ("experiment fig99 --output-dir other", 2, &["fig99", "fig5", "sharpness"]),
+        ("experiment office --output-dir other", 2, &["office", "--photographs"]),
+        ("experiment office --photographs nowhere --output-dir other", 1, &["nowhere", "--photographs"]),
         ("baseline --output-dir other --method tripod --exposures 1,2 a.png b.png", 2, &["--tripod", "0 tripod frames for 2 frames"]),
         ("baseline --output-dir other --method mertens,mertens --exposures 1,2 a.png b.png", 2, &["--method", "named twice"]),
     ]);
