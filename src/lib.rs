@@ -34,6 +34,8 @@ pub mod noise;
 mod nonnegative;
 pub mod pipeline;
 pub mod pose;
+#[cfg(feature = "preview")]
+pub mod preview;
 pub mod psf;
 pub mod register;
 pub mod response;

@@ -17,11 +17,16 @@ use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 mod blind;
+mod engine;
 
 pub use blind::Blind;
+pub use engine::Engine;
+use engine::Memo;
 
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
 #[derive(Clone, Debug)]
@@ -42,6 +47,8 @@ pub struct Settings {
     pub focal_px: Option<f64>,
     /// Pixels (x, y) at which to look at the blur; empty: chosen.
     pub patches: Vec<(usize, usize)>,
+    /// Largest distance in pixels, per axis, to which a local PSF reaches; `None`: as far as the frame's TSF moves the patch, and a little.
+    pub psf_radius: Option<usize>,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
     /// What to do when no frame is sharp.
@@ -61,9 +68,26 @@ impl Default for Settings {
             model: Model::Auto,
             focal_px: None,
             patches: Vec::new(),
+            psf_radius: None,
             noise: None,
             blind: Blind::default(),
             deblur: deblur::Settings::default(),
+        }
+    }
+}
+
+impl Settings {
+    /// The same for frames whose sides are divided by `divisor`: lengths in pixels shrink with them.
+    #[must_use]
+    pub fn reduced(&self, divisor: usize) -> Self {
+        let squares = (divisor * divisor) as f64;
+        Self {
+            focal_px: self.focal_px.map(|f| f / divisor as f64),
+            patches: self.patches.iter().map(|&(x, y)| (x / divisor, y / divisor)).collect(),
+            psf_radius: self.psf_radius.map(|r| r.div_ceil(divisor)),
+            // Means of squares of pixels have less noise than the pixels.
+            noise: self.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares }),
+            ..self.clone()
         }
     }
 }
@@ -80,9 +104,27 @@ pub enum Event {
     },
     /// Something the user should know; the merge goes on.
     Warning(String),
+    /// Irradiance as the solver has it, to be looked at while it works.
+    Estimate(Estimate),
+}
+
+/// The solver's own irradiance on the device: it changes with every iteration.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// Red, green, blue: (width + 2 pad) x (height + 2 pad) values each, row by row, irradiance E.
+    pub planes: [wgpu::Buffer; 3],
+    /// Pixels per row of the frame.
+    pub width: usize,
+    /// Rows of the frame.
+    pub height: usize,
+    /// Pixels that surround the frame on every side.
+    pub pad: usize,
+    /// Exposure time in seconds of the reference frame: E times it is the unit of [`Outcome::irradiance`].
+    pub scale: f64,
 }
 
 /// Result of a merge.
+#[derive(Clone)]
 pub struct Outcome {
     /// Irradiance E times the reference frame's exposure time: 1.0 is that frame's white. Finite, not negative.
     pub irradiance: Rgb,
@@ -90,6 +132,13 @@ pub struct Outcome {
     pub reference: usize,
     /// Names of frames that the program, not the user, left out, and why.
     pub left_out: Vec<(String, String)>,
+    /// Why the result is less than was asked for, a sentence each: frames that had to be left out, and a merge where nothing could be
+    /// deblurred. Empty where all is as it should be.
+    pub degraded: Vec<String>,
+    /// Each frame's place: the motion from the reference frame, centred pixels; of shaken frames that of their mean pose.
+    pub places: Vec<DMat3>,
+    /// Masks m by which the frames counted, eq. (8), each on its own pixels.
+    pub masks: Vec<Plane>,
     /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
     pub misfit: Vec<Option<Plane>>,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
@@ -119,8 +168,10 @@ const PATCH_SIZE: usize = 96;
 const PSF_MARGIN: isize = 3;
 
 struct Run<'a> {
-    gpu: Gpu,
-    kernels: Kernels,
+    gpu: &'a Gpu,
+    kernels: &'a Kernels,
+    memo: &'a mut Memo,
+    stop: Option<Arc<AtomicBool>>,
     bracket: &'a Bracket,
     settings: &'a Settings,
     exposures: Vec<Rgb>,
@@ -131,9 +182,12 @@ struct Run<'a> {
     motions: Vec<DMat3>,
     registrations: Vec<Registration>,
     left_out: Vec<(String, String)>,
+    degraded: Vec<String>,
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
     blind: Value,
+    /// Exposure time of the reference frame, once it is chosen.
+    scale: f64,
 }
 
 /// Reconstructs the irradiance of `bracket`. `given`: TSFs to use instead of estimating them. `events` is called from
@@ -148,19 +202,44 @@ pub fn merge(
     given: Option<&TsfFile>,
     events: &mut dyn FnMut(Event) -> bool,
 ) -> Result<Outcome> {
+    check(bracket, settings)?;
+    merge_with(&mut Engine::new(Gpu::new()?), "", bracket, response, settings, given, events)
+}
+
+/// [`merge`] on an open device that remembers: a stage whose settings are those of an earlier merge is not run again, and the result is the
+/// same as if it were. `name`: whoever gives a name again promises the same frames and response.
+///
+/// # Errors
+/// As [`merge`].
+pub fn merge_with(
+    engine: &mut Engine,
+    name: &str,
+    bracket: &Bracket,
+    response: &Response,
+    settings: &Settings,
+    given: Option<&TsfFile>,
+    events: &mut dyn FnMut(Event) -> bool,
+) -> Result<Outcome> {
     let frames = bracket.frames();
     let excluded = check(bracket, settings)?;
-    let gpu = Gpu::new()?;
+    let stop = engine.stop.clone();
+    let (gpu, kernels, memo) = engine.parts(settings.deblur.interpolation);
     let start = Instant::now();
-    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
-    let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
+    // TSFs that are given decide about every stage.
+    memo.begin(if given.is_some() { None } else { Some(format!("{name} {:?}", settings.noise)) });
+    let (exposures, noise) = memo.prepared(|| {
+        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
+        let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
+        (exposures, noise)
+    });
     let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
     let motions = vec![DMat3::IDENTITY; frames.len()];
     let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
-    let kernels = Kernels::new(&gpu, settings.deblur.interpolation);
     let mut run = Run {
         gpu,
         kernels,
+        memo,
+        stop,
         bracket,
         settings,
         exposures,
@@ -170,9 +249,11 @@ pub fn merge(
         motions,
         registrations: vec![Registration::skipped(); frames.len()],
         left_out: Vec::new(),
+        degraded: Vec::new(),
         events,
         timings: Vec::new(),
         blind: Value::Null,
+        scale: 1.0,
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
     run.reconstruct(verdicts, excluded, given)
@@ -208,7 +289,14 @@ impl Run<'_> {
     }
 
     fn warn(&mut self, text: String) -> Result<()> {
+        self.memo.hear(&text);
         if (self.events)(Event::Warning(text)) { Ok(()) } else { Err(Error::Cancelled) }
+    }
+
+    /// A warning of a result that is less than was asked for.
+    fn degrade(&mut self, text: String) -> Result<()> {
+        self.degraded.push(text.clone());
+        self.warn(text)
     }
 
     fn timed<T>(&mut self, what: &str, f: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
@@ -218,10 +306,49 @@ impl Run<'_> {
         Ok(out)
     }
 
+    /// [`Run::timed`], unless an earlier merge has been here with the same settings: then what it found, and what it said. `more`: what it
+    /// depends on besides all that came before; `bytes`: size of what is found.
+    fn remembered<T: Clone + Send + 'static>(
+        &mut self,
+        name: &str,
+        more: &str,
+        bytes: fn(&T) -> usize,
+        f: impl FnOnce(&mut Self) -> Result<T>,
+    ) -> Result<T> {
+        let stage = format!("{name} {more}");
+        if let Some((found, said)) = self.memo.recall::<T>(&stage) {
+            for text in said {
+                self.warn(text)?;
+            }
+            return Ok(found);
+        }
+        let before = self.memo.said();
+        let found = self.timed(name, f)?;
+        // What was stopped half-way is nothing to remember.
+        if self.stop.as_ref().is_some_and(|s| s.load(Ordering::Relaxed)) {
+            return Err(Error::Cancelled);
+        }
+        self.memo.keep(&stage, &found, before, bytes(&found));
+        Ok(found)
+    }
+
+    /// [`Run::remembered`] of a stage that solves with `settings`.
+    fn solved(
+        &mut self,
+        name: &str,
+        more: &str,
+        settings: &deblur::Settings,
+        f: impl FnOnce(&mut Self) -> Result<Solution>,
+    ) -> Result<Solution> {
+        let bytes =
+            |s: &Solution| 4 * (3 * s.irradiance.width() * s.irradiance.height() + s.misfit.iter().map(|m| m.data.len()).sum::<usize>());
+        self.remembered(name, &format!("{more} {settings:?}"), bytes, f)
+    }
+
     /// A frame is left out because of what was found about it.
     fn leave_out(&mut self, i: usize, why: &str) -> Result<()> {
         let name = self.bracket.frames()[i].name.clone();
-        self.warn(format!("{name}: {why}; it is left out"))?;
+        self.degrade(format!("{name}: {why}; it is left out"))?;
         self.left_out.push((name, why.into()));
         Ok(())
     }
@@ -309,10 +436,31 @@ impl Run<'_> {
         }
         let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
         let verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
-            self.timed("registration", |run| run.align(verdicts, &mut excluded, &known))?
+            self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
+            let (verdicts, found, motions, registrations, left_out, degraded) = self.remembered(
+                "registration",
+                "",
+                |_| 0,
+                |run| {
+                    let verdicts = run.align(verdicts, &mut excluded, &known)?;
+                    Ok((
+                        verdicts,
+                        excluded.clone(),
+                        run.motions.clone(),
+                        run.registrations.clone(),
+                        run.left_out.clone(),
+                        run.degraded.clone(),
+                    ))
+                },
+            )?;
+            (excluded, self.motions, self.registrations) = (found, motions, registrations);
+            (self.left_out, self.degraded) = (left_out, degraded);
+            verdicts
         } else {
+            self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
             verdicts
         };
+        self.memo.depends(&(self.settings.alpha, self.settings.blind, self.settings.deblur.interpolation));
         let used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
         for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
             if let Some(tsf) = tsf {
@@ -331,9 +479,19 @@ impl Run<'_> {
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
-            self.warn("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
+            self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || doubtful || (!all_known && !sharp.contains(&true)) {
-            match self.timed("all blurs", |run| run.all_blurs(&used, doubtful, 0.03, 0.60))? {
+            let (found, motions, blind, degraded) = self.remembered(
+                "all blurs",
+                "",
+                |_| 0,
+                |run| {
+                    let found = run.all_blurs(&used, doubtful, 0.03, 0.60)?;
+                    Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
+                },
+            )?;
+            (self.motions, self.blind, self.degraded) = (motions, blind, degraded);
+            match found {
                 Some(found) => {
                     scene = Some(found.start);
                     centre = Some(found.reference);
@@ -356,6 +514,7 @@ impl Run<'_> {
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
         let reference = self.settings.reference.or(centre).or(found).unwrap_or(0);
+        self.scale = frames[reference].exposure_time;
         if scene.is_some() {
             for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
                 *motion = tsf.as_ref().map_or(*motion, Tsf::centre);
@@ -382,15 +541,16 @@ impl Run<'_> {
             outer: if start_frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { DISPLACED_OUTER } else { SHARP_OUTER },
             ..self.settings.deblur.clone()
         };
+        let first = if shaken.is_empty() { alone.clone() } else { for_estimates(&alone) };
         let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
-        let base = self.timed("sharp frames", |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.05, 0.10))?;
+        let base = self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
         let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
-            let (tsf, detail) = self.timed("blur", |run| Ok(run.estimate(i, &latent)))?;
+            let (tsf, detail) = self.blur(i, &latent)?;
             if tsf.is_none() {
                 self.leave_out(
                     i,
@@ -401,6 +561,7 @@ impl Run<'_> {
             tsfs[i] = tsf;
             details[i] = detail;
         }
+        self.memo.depends(&(self.settings.model, self.settings.focal_px));
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
         let mut all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
         let start = latent.clone();
@@ -412,7 +573,8 @@ impl Run<'_> {
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                    tsfs[i] = self.timed("refinement", |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
+                    let now = format!("{i} {round} {shaken:?}");
+                    tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
@@ -426,11 +588,15 @@ impl Run<'_> {
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
-                deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() }
+                let quick =
+                    deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() };
+                for_estimates(&quick)
             } else {
                 self.settings.deblur.clone()
             };
-            let solved = self.timed("irradiance", |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
+            let now = format!("{round} {shaken:?}");
+            let solved =
+                self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
             // TSFs that the user gave are believed.
             let hopeless: Vec<(usize, f64)> = estimated
@@ -453,7 +619,14 @@ impl Run<'_> {
             }
             solution = None;
         }
-        let solution = solution.unwrap_or(base);
+        let solution = match solution {
+            Some(found) => found,
+            // No shaken frame is left: the sharp ones alone, as the user wants them.
+            None if first != alone => {
+                self.solved("sharp frames", "alone", &alone, |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.90, 0.98))?
+            }
+            None => base,
+        };
         self.progress("finishing", 0.99)?;
         self.finish(solution, reference, &verdicts, &sharp, &all, &tsfs, details)
     }
@@ -470,6 +643,7 @@ impl Run<'_> {
         to: f32,
     ) -> Result<Solution> {
         let frames = self.bracket.frames();
+        let (w, h) = self.bracket.size();
         let observations: Vec<Observation> = ids
             .iter()
             .map(|&i| Observation {
@@ -483,10 +657,13 @@ impl Run<'_> {
             .collect();
         let moving = observations.iter().any(|o| !o.tsf.is_identity());
         let stage = if moving { "deblurring" } else { "merging the sharp frames" };
-        let events = &mut self.events;
-        let solved = deblur::solve(&self.gpu, &self.kernels, &observations, initial, pad, settings, &mut |f| {
-            events(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f })
-        })?;
+        let events = std::cell::RefCell::new(&mut self.events);
+        let mut watch = |planes: &[wgpu::Buffer; 3]| {
+            let estimate = Estimate { planes: planes.clone(), width: w, height: h, pad, scale: self.scale };
+            events.borrow_mut()(Event::Estimate(estimate));
+        };
+        let mut hear = |f: f32| events.borrow_mut()(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f });
+        let solved = deblur::solve_watched(self.gpu, self.kernels, &observations, initial, pad, settings, &mut watch, &mut hear)?;
         if solved.report.memory.reduced {
             self.warn("the GPU's memory is short: the work is done in smaller pieces, which takes longer".into())?;
         }
@@ -577,7 +754,18 @@ impl Run<'_> {
         (exposure.map(|v| v / dt), weight)
     }
 
-    /// TSF of frame `i` against the sharp irradiance, about where the frame lies; and, for people to look at, patches and their PSFs (11).
+    /// TSF of frame `i` against the sharp irradiance, and, for people to look at, patches and their PSFs (11).
+    fn blur(&mut self, i: usize, latent: &Rgb) -> Result<(Option<Tsf>, Value)> {
+        let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
+        let (tsf, mut detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, latent)))?;
+        if let Some(tsf) = &tsf {
+            let own = format!("{own} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
+            detail["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, latent, tsf)))?;
+        }
+        Ok((tsf, detail))
+    }
+
+    /// TSF of frame `i` against the sharp irradiance, about where the frame lies, and what is known of it.
     fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
         let base = self.base(i);
         let (seen, inside) = self.seen(latent, &base);
@@ -585,9 +773,8 @@ impl Run<'_> {
         let (blurred, weight) = self.luminance(i, &seen);
         let weight = weight.zip(&inside, |w, k| w * k);
         let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
-        let search = Search { model: self.settings.model, focal_px: self.settings.focal_px };
+        let search = Search { model: self.settings.model, focal_px: self.settings.focal_px, stop: self.stop.clone() };
         let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
-        let psfs = self.psfs(&seen, &blurred, &weight, &found.tsf);
         let detail = json!({
             "model": found.model,
             "focal_px": found.tsf.focal_px,
@@ -596,12 +783,24 @@ impl Run<'_> {
             "estimated_at_scale": found.scale,
             "extent_px": tsf::extent(&found.tsf, latent.width, latent.height),
             "residual": found.residual,
-            "patches": psfs.iter().map(|(p, m)| json!({
-                "x": p.x, "y": p.y, "size": p.size, "score": p.score, "confidence": m.confidence(), "expected_error": m.expected_error,
-                "psf": { "radius": m.psf.radius, "extent_px": m.psf.extent(), "values": m.psf.values.data },
-            })).collect::<Vec<_>>(),
         });
         (Some(found.tsf), detail)
+    }
+
+    /// Patches of frame `i` and their PSFs, as the report has them.
+    fn local_psfs(&self, i: usize, latent: &Rgb, tsf: &Tsf) -> Value {
+        let (seen, inside) = self.seen(latent, &tsf.base);
+        let (blurred, weight) = self.luminance(i, &seen);
+        let weight = weight.zip(&inside, |w, k| w * k);
+        let psfs = self.psfs(&seen, &blurred, &weight, tsf);
+        json!(
+            psfs.iter()
+                .map(|(p, m)| json!({
+                    "x": p.x, "y": p.y, "size": p.size, "score": p.score, "confidence": m.confidence(), "expected_error": m.expected_error,
+                    "psf": { "radius": m.psf.radius, "extent_px": m.psf.extent(), "values": m.psf.values.data },
+                }))
+                .collect::<Vec<_>>()
+        )
     }
 
     /// PSFs of chosen or given patches, looked for around where `tsf` passes.
@@ -616,7 +815,8 @@ impl Run<'_> {
         };
         let measure = |p: &psf::Patch| {
             let path = tsf::path_at(tsf, p.centre(), (w, h));
-            let radius = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
+            let reach = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
+            let radius = self.settings.psf_radius.map_or(reach, |r| r as isize);
             let near = |x: isize, y: isize| path.iter().any(|u| (u.0 - x).abs() <= PSF_MARGIN && (u.1 - y).abs() <= PSF_MARGIN);
             Some((*p, psf::estimate_within(seen, 0, blurred, weight, p, radius as usize, &near)?))
         };
@@ -689,6 +889,7 @@ impl Run<'_> {
             "noise": self.noise,
             "blind": blind,
             "frames": entries,
+            "degraded": self.degraded,
             "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,
             "timings_s": std::mem::take(&mut self.timings),
@@ -697,8 +898,16 @@ impl Run<'_> {
         for (&i, plane) in all.iter().zip(solution.misfit) {
             misfit[i] = Some(plane);
         }
-        Ok(Outcome { irradiance, reference, left_out: self.left_out, misfit, report })
+        let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
+        let Self { left_out, degraded, masks, .. } = self;
+        Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }
+}
+
+/// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.
+fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
+    let standard = deblur::Settings::default();
+    deblur::Settings { lambda: standard.lambda, robust: standard.robust, ..settings.clone() }
 }
 
 /// Displacement in pixels of a blurred frame that the search for its poses covers by itself.

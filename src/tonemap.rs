@@ -9,7 +9,7 @@ mod fattal;
 mod filter;
 mod operator;
 
-pub use operator::Operator;
+pub use operator::{Curve, Light, Operator};
 
 use crate::image::{Plane, Rgb};
 use rayon::prelude::*;

@@ -51,6 +51,9 @@ pub(super) enum Command {
     Adapters,
     /// Make a picture for the screen from a linear image
     Tonemap(TonemapArgs),
+    /// Open a window: see a bracket, nudge it, export it
+    #[cfg(feature = "preview")]
+    Preview(super::preview::PreviewArgs),
     /// Find the brackets among many photographs and merge each
     Batch(BatchArgs),
     /// Print the completions of a shell, or the manual page
@@ -103,7 +106,16 @@ pub(super) struct MergeArgs {
     /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
     pub patch: Vec<String>,
-    /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
+    /// Largest reach in pixels of the local blurs (PSFs) that the report shows [default: as far as the camera's motion takes the place]
+    #[arg(long, value_name = "R", allow_hyphen_values = true)]
+    pub psf_radius: Option<String>,
+    /// Weight of the smoothness (total variation of log irradiance): more is smoother and less noisy [default: 2.5]
+    #[arg(long, value_name = "L", allow_hyphen_values = true)]
+    pub lambda: Option<String>,
+    /// How much a shaken frame loses weight where its blur does not explain it: 0 (trusted everywhere) and more [default: 1]
+    #[arg(long, value_name = "C", allow_hyphen_values = true)]
+    pub robust: Option<String>,
+    /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
     /// Interpolation of the warps
@@ -163,13 +175,16 @@ pub(super) struct PhotoArgs {
     /// Tone mapping of --preview: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1 [default: filmic]
     #[arg(long, value_name = "OP[:NAME=V,...]", help_heading = "Result")]
     pub tonemap: Option<String>,
+    /// Give the JPEG of --preview a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long, help_heading = "Result")]
+    pub gain_map: bool,
     /// Write one page (HTML) that shows everything: before and after, frames, masks, blur, residuals, settings
     #[arg(long, value_name = "OUT.html", help_heading = "Result")]
     pub report_html: Option<PathBuf>,
     /// Options from a TOML file [default: unshaken/config.toml in the user's configuration folder, where it exists]
     #[arg(long, value_name = "FILE.toml", help_heading = "Settings")]
     pub config: Option<PathBuf>,
-    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: fast, archive
+    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: archive, small
     #[arg(long, value_name = "NAME", help_heading = "Settings")]
     pub preset: Option<String>,
     /// Print the options that are in force, as a configuration file, and stop
@@ -188,6 +203,9 @@ pub(super) struct TonemapArgs {
     /// Operator: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1,saturation=0.9
     #[arg(long, value_name = "OP[:NAME=V,...]", default_value = "filmic")]
     pub tonemap: String,
+    /// Give the JPEG a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long)]
+    pub gain_map: bool,
     /// Quality of a JPEG, 1 to 100
     #[arg(long, value_name = "N", default_value_t = 92, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,

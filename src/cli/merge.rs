@@ -3,52 +3,113 @@
 use super::args::MergeArgs;
 use super::progress::done;
 use super::{Done, Usage, frames, interrupt, page, with_progress};
-use crate::colour::{self, Primaries};
+use crate::colour::{self, Matrix, Primaries};
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::{self, Radiometry};
+use crate::io::metadata::Metadata;
 use crate::io::output::{self, Output};
 use crate::layers;
 use crate::noise::NoiseModel;
-use crate::pipeline::{self, Blind, Event, Settings};
+use crate::pipeline::{self, Blind, Event, Outcome, Settings};
 use crate::response::{Response, ResponseFile};
 use crate::tonemap::Operator;
 use crate::tsf::{Interpolation, Model, TsfFile};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
-    let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
-    let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
-    let settings = settings(args)?;
-    let divisor = args.scale.as_deref().map_or(Ok(1), divisor)?;
-    frames::check(&args.frames)?;
-    let word = args.response.as_deref().filter(|r| *r != "auto");
-    let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
-    let response_file = word.filter(|_| named.is_none()).map(Path::new);
-    let targets = outputs(args, response_file)?;
-    let photo = PhotoSettings::of(args)?;
+    let job = Job::of(args)?;
+    let targets = outputs(args, job.response_file.as_deref())?;
+    let (text, quality) = with_progress(|events| {
+        let mut opened = job.open(events)?;
+        let settings = job.settings(&opened)?.reduced(job.divisor);
+        let tsf = job.tsf.as_ref().map(|t| t.reduced(job.divisor));
+        if job.divisor > 1 {
+            // The frames themselves are not needed any more: their memory is.
+            opened.bracket = Arc::new(crate::response::reduced(&opened.bracket, &opened.response, job.divisor)?);
+        }
+        let mut warnings = Vec::new();
+        let outcome = pipeline::merge(&opened.bracket, &opened.response, &settings, tsf.as_ref(), &mut |event| {
+            if let Event::Warning(text) = &event {
+                warnings.push(text.clone());
+            }
+            events(event)
+        })?;
+        let text = job.write(&targets, &opened, &opened.bracket, &outcome, &warnings, events)?;
+        let as_asked = opened.degraded.is_empty() && outcome.degraded.is_empty();
+        let quality = if as_asked { Done::AsAsked } else { Done::Degraded };
+        Ok((text, quality))
+    })?;
+    done(&text, json!({ "output": args.output, "degraded": quality == Done::Degraded }));
+    Ok(if args.strict { quality } else { Done::AsAsked })
+}
 
-    let given = match (named, response_file) {
-        (None, Some(path)) => Some(read_response(path)?),
-        (named, _) => named,
-    };
-    let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
-    if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
-        check_tsf_names(file, path, &args.frames)?;
+/// A merge as its arguments ask for it, understood and checked as far as this needs no pixels.
+pub(super) struct Job<'a> {
+    args: &'a MergeArgs,
+    times: Option<Vec<f64>>,
+    values: Option<Vec<f64>>,
+    settings: Settings,
+    divisor: usize,
+    response: Option<Response>,
+    pub response_file: Option<PathBuf>,
+    tsf: Option<TsfFile>,
+    photo: PhotoSettings,
+}
+
+/// The frames of a merge, and what the files say that pixels do not.
+pub(super) struct Opened {
+    pub bracket: Arc<Bracket>,
+    pub response: Response,
+    /// What the report says of the response.
+    origin: Value,
+    /// Why the response is less than was asked for.
+    degraded: Vec<String>,
+    /// Noise that the files note.
+    noise: Option<NoiseModel>,
+    /// Of each frame, linear RGB to XYZ relative to D50.
+    pub to_xyz: Vec<Matrix>,
+    metadata: Vec<Metadata>,
+    notes: Vec<String>,
+}
+
+impl<'a> Job<'a> {
+    pub fn of(args: &'a MergeArgs) -> anyhow::Result<Self> {
+        let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
+        let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
+        let settings = settings(args)?;
+        let divisor = args.scale.as_deref().map_or(Ok(1), divisor)?;
+        frames::check(&args.frames)?;
+        let word = args.response.as_deref().filter(|r| *r != "auto");
+        let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
+        let response_file = word.filter(|_| named.is_none()).map(PathBuf::from);
+        let photo = PhotoSettings::of(args)?;
+        let response = match (named, &response_file) {
+            (None, Some(path)) => Some(read_response(path)?),
+            (named, _) => named,
+        };
+        let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
+        if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
+            check_tsf_names(file, path, &args.frames)?;
+        }
+        Ok(Self { args, times, values, settings, divisor, response, response_file, tsf, photo })
     }
 
-    let (text, quality) = with_progress(|events| {
+    /// Reads the frames and finds their response.
+    pub fn open(&self, events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened> {
+        let args = self.args;
         events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
-        let mut loaded = frames::load(&args.frames, times.clone().or(values), photo.white)?;
-        if times.is_some() {
+        let mut loaded = frames::load(&args.frames, self.times.clone().or(self.values.clone()), self.photo.white)?;
+        if self.times.is_some() {
             for (noted, frame) in loaded.metadata.iter_mut().zip(loaded.bracket.frames()) {
                 noted.exposure_time = Some(frame.exposure_time);
             }
         }
-        let frames::Loaded { bracket, stated, to_xyz, metadata, notes } = loaded;
-        if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
+        let frames::Loaded { bracket, stated, to_xyz, metadata, noise, notes } = loaded;
+        if let (Some(file), Some(path)) = (&self.tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
         for note in &notes {
@@ -71,39 +132,47 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         let jpeg = args.frames.iter().all(|p| ["jpg", "jpeg"].contains(&output::ending(p).as_str()));
         let stated = stated.filter(|_| linear || !jpeg && args.response.as_deref() != Some("auto"));
         let (stated_by, stated) = stated.map_or((None, None), |(what, response)| (Some(what), Some(response)));
-        let by_file = given.is_none().then_some(stated_by).flatten();
-        let (response, mut origin) = super::response::choose(args, given.or(stated), &bracket, events)?;
+        let by_file = self.response.is_none().then_some(stated_by).flatten();
+        let chosen = super::response::choose(args, self.response.clone().or(stated), &bracket, events)?;
+        let (response, mut origin, degraded) = (chosen.response, chosen.report, chosen.degraded);
         if let Some(what) = by_file {
             origin["origin"] = json!(format!("stated by the files: {what}"));
         }
-        if args.frames.len() == settings.exclude.len() + 1 {
+        if args.frames.len() == self.settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
-        let mut settings = settings.clone();
-        if settings.focal_px.is_none() {
-            let (w, h) = bracket.size();
-            settings.focal_px = frames::focal_px(&args.frames[0], w, h)?;
-        }
-        // Lengths in pixels shrink with the frames.
-        settings.focal_px = settings.focal_px.map(|f| f / divisor as f64);
-        settings.patches.iter_mut().for_each(|(x, y)| (*x, *y) = (*x / divisor, *y / divisor));
-        let tsf = tsf.as_ref().map(|t| t.reduced(divisor));
-        let bracket = if divisor == 1 { bracket } else { crate::response::reduced(&bracket, &response, divisor)? };
-        let mut degraded = Vec::new();
-        let mut outcome = pipeline::merge(&bracket, &response, &settings, tsf.as_ref(), &mut |event| {
-            if let Event::Warning(text) = &event {
-                degraded.push(text.clone());
-            }
-            events(event)
-        })?;
-        events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
+        Ok(Opened { bracket: Arc::new(bracket), response, origin, degraded, noise, to_xyz, metadata, notes })
+    }
 
+    /// The settings for frames of full size.
+    pub fn settings(&self, opened: &Opened) -> anyhow::Result<Settings> {
+        let mut settings = self.settings.clone();
+        if settings.focal_px.is_none() {
+            let (w, h) = opened.bracket.size();
+            settings.focal_px = frames::focal_px(&self.args.frames[0], w, h)?;
+        }
+        settings.noise = settings.noise.or(opened.noise);
+        Ok(settings)
+    }
+
+    /// Writes all outputs of the merge of `bracket`, which is that of `opened` or a reduced one.
+    pub fn write(
+        &self,
+        targets: &Targets,
+        opened: &Opened,
+        bracket: &Bracket,
+        outcome: &Outcome,
+        warnings: &[String],
+        events: &mut dyn FnMut(Event) -> bool,
+    ) -> anyhow::Result<String> {
+        let (args, photo) = (self.args, &self.photo);
+        events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
         let reference = &bracket.frames()[outcome.reference];
-        let noted = &metadata[outcome.reference];
+        let noted = &opened.metadata[outcome.reference];
         let radiometry = Radiometry { exposure_time: reference.exposure_time, frame: reference.name.clone() };
-        let layers = if args.photo.layers { layers::layers(&bracket, &response, &outcome) } else { Vec::new() };
-        let own = &to_xyz[outcome.reference];
+        let layers = if args.photo.layers { layers::layers(bracket, &opened.response, outcome) } else { Vec::new() };
+        let own = &opened.to_xyz[outcome.reference];
         let in_primaries = |primaries: Primaries| {
             let mut image = outcome.irradiance.clone();
             let back = colour::inverse(&primaries.to_xyz()).expect("standard primaries");
@@ -122,14 +191,27 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         if let Some(white) = absolute {
             linear = linear.map_planes(|p| p.map(|v| v * white as f32));
         }
-        if let Some(report) = outcome.report.as_object_mut() {
-            report.insert("response".into(), origin);
-            report.insert("exposure_notes".into(), json!(notes));
-            report.insert("warnings".into(), json!(degraded));
-            report.insert(
-                "colour".into(),
-                json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),
-            );
+        let mut outcome = std::borrow::Cow::Borrowed(outcome);
+        if targets.page.is_some() || targets.report.is_some() {
+            let noise_origin = match (self.settings.noise, opened.noise) {
+                (Some(_), _) => "given",
+                (None, Some(_)) => "noted by the files",
+                (None, None) => "estimated from the frames",
+            };
+            let degraded: Vec<&String> = opened.degraded.iter().chain(&outcome.degraded).collect();
+            let degraded = json!(degraded);
+            let outcome = outcome.to_mut();
+            if let Some(report) = outcome.report.as_object_mut() {
+                report.insert("response".into(), opened.origin.clone());
+                report.insert("noise_origin".into(), json!(noise_origin));
+                report.insert("exposure_notes".into(), json!(opened.notes));
+                report.insert("warnings".into(), json!(warnings));
+                report.insert("degraded".into(), degraded);
+                report.insert(
+                    "colour".into(),
+                    json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),
+                );
+            }
         }
 
         // All are complete before the first is renamed.
@@ -145,16 +227,22 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
         if targets.preview.is_some() || targets.page.is_some() {
             let display = in_primaries(Primaries::Rec709).0;
             if let Some(target) = &targets.preview {
-                staged.push(target.stage_picture(&photo.operator.apply(&display), JPEG_QUALITY, noted)?);
+                let picture = photo.operator.apply(&display);
+                staged.push(if args.photo.gain_map {
+                    target.stage_gain_map(&picture, &display, JPEG_QUALITY, noted)?
+                } else {
+                    target.stage_picture(&picture, JPEG_QUALITY, noted)?
+                });
             }
             if let Some(target) = &targets.page {
                 let page = page::Page {
-                    bracket: &bracket,
-                    response: &response,
+                    bracket,
+                    response: &opened.response,
                     outcome: &outcome,
                     display: &display,
                     to_display: colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries"), own),
-                    warnings: &degraded,
+                    warnings,
+                    divisor: self.divisor,
                     settings: photo.listing(args),
                 };
                 staged.push(target.stage_text(&page.html())?);
@@ -167,11 +255,8 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
             return Err(Error::Cancelled.into());
         }
         output::commit_all(staged)?;
-        let quality = if degraded.is_empty() { Done::AsAsked } else { Done::Degraded };
-        Ok((summary(args, &bracket, outcome.reference), quality))
-    })?;
-    done(&text, json!({ "output": args.output, "degraded": quality == Done::Degraded }));
-    Ok(if args.strict { quality } else { Done::AsAsked })
+        Ok(summary(args, bracket, outcome.reference))
+    }
 }
 
 /// Quality of a JPEG preview.
@@ -221,8 +306,13 @@ impl PhotoSettings {
         if photo.tonemap.is_some() && args.preview.is_none() {
             return refuse("--tonemap", "is for the picture of --preview; name one");
         }
-        if let Some(path) = &args.preview {
-            check_picture_name("--preview", path)?;
+        match &args.preview {
+            Some(path) => {
+                check_picture_name("--preview", path)?;
+                check_gain_map(photo.gain_map, "--preview", path)?;
+            }
+            None if photo.gain_map => return refuse("--gain-map", "is for the picture of --preview; name one"),
+            None => {}
         }
         Ok(Self { white, primaries, operator })
     }
@@ -248,8 +338,10 @@ impl PhotoSettings {
             ("--layers".into(), set(args.photo.layers)),
             ("--tonemap".into(), self.operator.to_string()),
             ("--no-align".into(), set(args.no_align)),
-            ("--noise".into(), or(&args.noise, "estimated")),
+            ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
+            ("--lambda".into(), or(&args.lambda, "2.5")),
+            ("--robust".into(), or(&args.robust, "1")),
         ]
     }
 }
@@ -260,6 +352,14 @@ pub(super) fn check_picture_name(option: &str, path: &Path) -> Result<(), Usage>
         "png" | "jpg" | "jpeg" => Ok(()),
         _ => Err(Usage(format!("{option}: {} ends with neither .png nor .jpg; name the format by the ending", path.display()))),
     }
+}
+
+/// Gain maps are for JPEG.
+pub(super) fn check_gain_map(asked: bool, option: &str, path: &Path) -> Result<(), Usage> {
+    if asked && !["jpg", "jpeg"].contains(&output::ending(path).as_str()) {
+        return Err(Usage(format!("--gain-map: only JPEG holds a gain map; name the picture of {option} .jpg")));
+    }
+    Ok(())
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
@@ -306,6 +406,23 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     for word in &args.patch {
         let pixel = word.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
         settings.patches.push(pixel.ok_or_else(|| Usage(format!("--patch: {word:?} is not a pixel such as 120,80")))?);
+    }
+    if let Some(word) = &args.psf_radius {
+        let radius = word.parse().ok().filter(|r| (1..=200).contains(r));
+        settings.psf_radius = Some(radius.ok_or_else(|| Usage(format!("--psf-radius: {word:?} is not a number of pixels from 1 to 200")))?);
+    }
+    let number = |option: &str, word: &Option<String>, (low, high): (f32, f32)| match word {
+        None => Ok(None),
+        Some(word) => match word.parse::<f32>().ok().filter(|v| (low..=high).contains(v)) {
+            Some(v) => Ok(Some(v)),
+            None => Err(Usage(format!("{option}: {word:?} is not a number from {low} to {high}"))),
+        },
+    };
+    if let Some(lambda) = number("--lambda", &args.lambda, (0.01, 1000.0))? {
+        settings.deblur.lambda = lambda;
+    }
+    if let Some(robust) = number("--robust", &args.robust, (0.0, 100.0))? {
+        settings.deblur.robust = robust;
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
     settings.deblur.interpolation = match args.interpolation.as_str() {
@@ -400,14 +517,14 @@ fn noise_level(text: &str) -> Result<NoiseModel, Usage> {
 }
 
 /// The outputs, of which each can be written.
-struct Targets {
+pub(super) struct Targets {
     linear: Output,
     preview: Option<Output>,
     report: Option<Output>,
     page: Option<Output>,
 }
 
-fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
+pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
     inputs.extend(response_file.map(|p| ("response file", p)));
     inputs.extend(args.tsf.as_deref().map(|p| ("TSF file", p)));

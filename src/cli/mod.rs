@@ -18,10 +18,15 @@ mod interrupt;
 mod merge;
 mod options;
 mod page;
+#[cfg(feature = "preview")]
+pub mod preview;
 mod progress;
 mod response;
 mod synth;
 mod tonemap;
+
+pub use grouping::manifest_brackets;
+pub use options::configured_options;
 
 use crate::error::Error;
 use crate::pipeline::Event;
@@ -80,6 +85,8 @@ pub fn run() -> ExitCode {
         args::Command::Adapters => adapters::run().map(as_asked),
         args::Command::Tonemap(a) => tonemap::run(a).map(as_asked),
         args::Command::Batch(a) => batch::run(a, &line.merge_options),
+        #[cfg(feature = "preview")]
+        args::Command::Preview(a) => preview::run(a).map(as_asked),
         args::Command::Generate(a) => generate::run(a).map(as_asked),
     };
     match done {
@@ -96,6 +103,7 @@ fn with_progress<T>(job: impl FnOnce(&mut dyn FnMut(Event) -> bool) -> anyhow::R
         match event {
             Event::Progress { stage, fraction } => progress.at(&stage, fraction),
             Event::Warning(text) => progress.warn(&text),
+            Event::Estimate(_) => {}
         }
         !interrupt::asked()
     })

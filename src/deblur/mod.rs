@@ -50,7 +50,7 @@ pub struct Observation {
 }
 
 /// What can be set about the solver.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
     /// Weight λ of total variation per unit of log irradiance, for three channels together.
     pub lambda: f32,
@@ -129,6 +129,7 @@ pub struct SolveReport {
 }
 
 /// Irradiance and how it was reached.
+#[derive(Clone)]
 pub struct Solution {
     /// Irradiance on the frame's grid plus the pad on every side.
     pub irradiance: Rgb,
@@ -291,6 +292,24 @@ pub fn solve(
     settings: &Settings,
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Solution> {
+    solve_watched(gpu, kernels, observations, initial, pad, settings, &mut |_| (), progress)
+}
+
+/// [`solve`] that shows the estimate while it works: `watch` receives the irradiance's buffers (of the size of `initial`) once, before the
+/// first iteration; every iteration writes them anew.
+///
+/// # Errors
+/// As [`solve`].
+pub fn solve_watched(
+    gpu: &Gpu,
+    kernels: &Kernels,
+    observations: &[Observation],
+    initial: &Rgb,
+    pad: usize,
+    settings: &Settings,
+    watch: &mut dyn FnMut(&Channels),
+    progress: &mut dyn FnMut(f32) -> bool,
+) -> Result<Solution> {
     let (mut limit, mut reduced) = (settings.memory_limit.unwrap_or(u64::MAX), false);
     loop {
         match Solver::new(gpu, kernels, observations, initial, pad, settings, limit) {
@@ -302,6 +321,7 @@ pub fn solve(
             solver => {
                 let mut solver = solver?;
                 solver.memory.reduced = reduced;
+                watch(&solver.state.irradiance);
                 return solver.run(progress);
             }
         }

@@ -7,7 +7,8 @@ pub use kernel::{Kernel, Step, grid_1d};
 pub use readback::read;
 
 use crate::error::{Error, Result};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 /// What to install when no adapter is found, per system.
 const ADVICE: &str = "Linux: install your GPU's Vulkan driver, or the software one (Debian/Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1; \
@@ -38,6 +39,8 @@ pub struct Gpu {
     memory_limit: u64,
     /// Bytes of planes made since [`Gpu::start_count`].
     counted: AtomicU64,
+    /// Steps per submission where others draw on the same device.
+    pace: Option<AtomicUsize>,
 }
 
 /// Some rows of an image in a buffer, as a dispatch sees them.
@@ -51,6 +54,8 @@ pub struct Rows<'a> {
 /// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
 /// alignment that every adapter accepts.
 const ROW_STEP: usize = 64;
+/// Longest submission on a device on which others draw: what is left of a sixtieth of a second when they have drawn.
+const TURN: Duration = Duration::from_millis(10);
 /// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 4e8 pixels times taps per second; 0.4 s.
 const BUDGET_CPU: f64 = 1.5e8;
 /// Of a GPU: the slowest integrated ones make about 2e10; 50 ms.
@@ -60,10 +65,16 @@ fn describe(info: &wgpu::AdapterInfo) -> String {
     format!("{} ({:?}, {:?}, {} {})", info.name, info.backend, info.device_type, info.driver, info.driver_info)
 }
 
-/// All adapters, best first: real GPUs before software; `WGPU_ADAPTER_NAME` (part of the name) puts its own first.
+/// All adapters, best first.
 fn adapters() -> Vec<wgpu::Adapter> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle_from_env());
     let mut all = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    rank(&mut all);
+    all
+}
+
+/// Orders adapters, best first: real GPUs before software; `WGPU_ADAPTER_NAME` (part of the name) puts its own first.
+pub fn rank(all: &mut [wgpu::Adapter]) {
     let wanted = std::env::var("WGPU_ADAPTER_NAME").unwrap_or_default().to_lowercase();
     all.sort_by_key(|a| {
         let info = a.get_info();
@@ -77,7 +88,17 @@ fn adapters() -> Vec<wgpu::Adapter> {
         };
         (!named, kind)
     });
-    all
+}
+
+/// The device that [`Gpu::new`] asks of an adapter, for those who open it themselves and share it by [`Gpu::shared`].
+pub fn device_descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'static> {
+    let available = adapter.limits();
+    let limits = wgpu::Limits {
+        max_storage_buffer_binding_size: available.max_storage_buffer_binding_size,
+        max_buffer_size: available.max_buffer_size,
+        ..wgpu::Limits::default()
+    };
+    wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() }
 }
 
 /// The adapters of this machine in order of preference.
@@ -110,21 +131,24 @@ impl Gpu {
     /// [`Error::Adapter`] when there is none or it refuses a device.
     pub fn new() -> Result<Self> {
         let adapter = adapters().into_iter().next().ok_or_else(|| Error::Adapter(format!("no GPU adapter found. {ADVICE}")))?;
+        let (device, queue) = pollster::block_on(adapter.request_device(&device_descriptor(&adapter)))
+            .map_err(|e| Error::Adapter(format!("{}: refuses a device ({e}). {ADVICE}", describe(&adapter.get_info()))))?;
+        Ok(Self::on(&adapter, device, queue))
+    }
+
+    fn on(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Self {
         let info = adapter.get_info();
-        let available = adapter.limits();
-        let limits = wgpu::Limits {
-            max_storage_buffer_binding_size: available.max_storage_buffer_binding_size,
-            max_buffer_size: available.max_buffer_size,
-            ..wgpu::Limits::default()
-        };
-        let descriptor = wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() };
-        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
-            .map_err(|e| Error::Adapter(format!("{}: refuses a device ({e}). {ADVICE}", describe(&info))))?;
         let dispatch_budget = if info.device_type == wgpu::DeviceType::Cpu { BUDGET_CPU } else { BUDGET_GPU };
         let limits = device.limits();
         let binding_limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let description = describe(&info);
-        Ok(Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0) })
+        Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0), pace: None }
+    }
+
+    /// A device that others draw on as well. Work is submitted in small turns, each awaited before the next, so that what they draw
+    /// comes in between; results are those of [`Gpu::new`].
+    pub fn shared(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Self {
+        Self { pace: Some(AtomicUsize::new(1)), ..Self::on(adapter, device, queue) }
     }
 
     /// The same with `bytes` of memory for planes at most, as on an adapter that has no more.
@@ -240,7 +264,10 @@ impl Gpu {
     pub fn submit(&self, steps: &[Step]) {
         // A submission is bounded so that a slow driver's watchdog does not fire. Uploads stand between submissions.
         for run in steps.chunk_by(|a, b| matches!(a, Step::Upload(..)) == matches!(b, Step::Upload(..))) {
-            for part in run.chunks(1024) {
+            let mut rest = run;
+            while !rest.is_empty() {
+                let (part, later) = rest.split_at(self.pace.as_ref().map_or(1024, |p| p.load(Ordering::Relaxed)).min(rest.len()));
+                rest = later;
                 let mut encoder = self.device.create_command_encoder(&Default::default());
                 kernel::record(part, &mut encoder);
                 for step in part {
@@ -248,8 +275,21 @@ impl Gpu {
                         self.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
                     }
                 }
-                self.queue.submit([encoder.finish()]);
+                let start = Instant::now();
+                let index = self.queue.submit([encoder.finish()]);
+                if let Some(pace) = &self.pace {
+                    self.end_turn(pace, part.len(), index, start);
+                }
             }
         }
+    }
+
+    /// Waits for a turn and makes the next as long as it should have been.
+    fn end_turn(&self, pace: &AtomicUsize, steps: usize, index: wgpu::SubmissionIndex, start: Instant) {
+        // A device that does not answer is noticed, and told, where results are read.
+        let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
+        let fits = (steps as f64 * TURN.as_secs_f64() / start.elapsed().as_secs_f64().max(1e-6)) as usize;
+        let now = pace.load(Ordering::Relaxed);
+        pace.store(fits.clamp(now / 2, 2 * now).clamp(1, 1024), Ordering::Relaxed);
     }
 }

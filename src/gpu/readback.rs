@@ -6,7 +6,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 /// Longest wait for the device. A software rasteriser on two cores needs tens of seconds for the largest submissions.
-const TIMEOUT: Duration = Duration::from_secs(600);
+pub(super) const TIMEOUT: Duration = Duration::from_secs(600);
 
 /// The first `count` values of `buffer`, after everything submitted so far.
 ///

@@ -2,10 +2,12 @@
 
 mod blur;
 mod data;
+mod display;
 mod linear;
 
 pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
 pub use data::{DataKernels, MisfitSource, NOISE_STEPS, WeightTarget};
+pub use display::{Display, DisplayParams, Place};
 pub use linear::{LinearKernels, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, partials_1d, partials_2d};
 
 use crate::gpu::Gpu;
@@ -71,11 +73,13 @@ pub const SHADERS: &[(&str, &str)] = &[
     ("cg_direction", linear::CG_DIRECTION),
     ("cg_scalars", linear::CG_SCALARS),
     ("update", linear::UPDATE),
+    ("display", display::DISPLAY),
 ];
 
 /// Sizes of the Rust mirrors of the shaders' `Params` as (shader, bytes), to be compared with what naga lays out.
 pub fn params_sizes() -> Vec<(&'static str, usize)> {
-    [blur::params_sizes(), data::params_sizes(), linear::params_sizes()].concat()
+    let display = vec![("display", size_of::<DisplayParams>())];
+    [blur::params_sizes(), data::params_sizes(), linear::params_sizes(), display].concat()
 }
 
 /// Sizes of the Rust mirrors of the shaders' table entries as (shader, structure, bytes), likewise.

@@ -29,6 +29,7 @@ pub enum Blind {
 }
 
 /// Irradiance to start from and one TSF for each of the frames used.
+#[derive(Clone)]
 pub(super) struct Found {
     pub start: Rgb,
     pub tsfs: Vec<Tsf>,
@@ -124,7 +125,7 @@ impl Run<'_> {
             Ok(found) => found,
             Err(Lack::Cancelled) => return Err(Error::Cancelled),
             Err(Lack::Texture(k)) => {
-                self.warn(format!(
+                self.degrade(format!(
                     "{}: shares no patch of enough texture with {}, unclipped in both, to find its blur; the frames are merged without \
                      deblurring (--blind joint may find more)",
                     name(k),
@@ -197,7 +198,7 @@ impl Run<'_> {
             return Ok(None);
         }
         if !believed {
-            self.warn(format!(
+            self.degrade(format!(
                 "no frame is sharp, and camera shake explains the frames no better than a merge (residuals {joint:.1} against {alone:.1} \
                  times the noise): they are merged without deblurring, the least blurred weighted most"
             ))?;

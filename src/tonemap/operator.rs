@@ -21,6 +21,37 @@ enum Kind {
     Fattal,
 }
 
+/// What automatic exposure looks at in an image, in its unit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Light {
+    /// Logarithmic mean of the luminance.
+    pub middle: f32,
+    /// 99.9th percentile of the luminance.
+    pub high: f32,
+}
+
+impl Light {
+    /// The light of `image` (linear Rec. 709).
+    pub fn of(image: &Rgb) -> Self {
+        let s = Statistics::of(&luminance(image));
+        Self { middle: s.middle, high: s.high }
+    }
+}
+
+/// An operator that treats every pixel alike, as numbers for whoever draws by itself: a luminance Y of the image shows as
+/// c(gain · Y), with colours as [`Operator::apply`] keeps them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Curve {
+    /// Whether c is the filmic curve; otherwise Reinhard's.
+    pub filmic: bool,
+    /// Luminance to exposed luminance.
+    pub gain: f32,
+    /// Exposed luminance that becomes white.
+    pub white: f32,
+    /// 1 keeps the colours, 0 is grey.
+    pub saturation: f32,
+}
+
 /// Name, default, smallest and largest value, meaning.
 type Parameter = (&'static str, f32, f32, f32, &'static str);
 
@@ -141,6 +172,16 @@ impl Operator {
             Kind::Fattal => self.fattal(&lum),
         };
         colour(image, &lum, &shown, self.value("saturation"))
+    }
+
+    /// The operator's curve under this light; `None` where a pixel's surroundings matter.
+    pub fn curve(&self, light: &Light) -> Option<Curve> {
+        if !matches!(self.kind, Kind::Filmic | Kind::Reinhard) {
+            return None;
+        }
+        let gain = self.value("key") / light.middle * self.value("exposure").exp2();
+        let statistics = Statistics { low: 0.0, middle: light.middle, high: light.high, gain };
+        Some(Curve { filmic: self.kind == Kind::Filmic, gain, white: self.white(&statistics), saturation: self.value("saturation") })
     }
 
     /// Luminance over that which becomes the key, exposure included.

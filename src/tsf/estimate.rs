@@ -13,6 +13,8 @@ use crate::pose::{Pose, PoseGrid, project};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// What is asked of [`WholeFrame::estimate`].
 #[derive(Clone, Debug, Default)]
@@ -21,6 +23,14 @@ pub struct Search {
     pub model: Model,
     /// Focal length in pixels; `None`: found where pitch and yaw show it, else 1.2 times the longer side.
     pub focal_px: Option<f64>,
+    /// Once this is set the estimate is not wanted any more, and what comes back is of no use.
+    pub stop: Option<Arc<AtomicBool>>,
+}
+
+impl Search {
+    fn is_stopped(&self) -> bool {
+        self.stop.as_ref().is_some_and(|s| s.load(Ordering::Relaxed))
+    }
 }
 
 /// A model that was tried.
@@ -267,6 +277,9 @@ impl WholeFrame<'_> {
         let planar = if search.model == Model::Translation { Model::Translation } else { Model::Rigid };
         let mut l = count;
         loop {
+            if search.is_stopped() {
+                return None;
+            }
             let scale = (1 << l) as f64;
             let frame = level(l);
             let (fw, fh) = frame.size();
@@ -325,6 +338,7 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
     let start = scaled(tsf, 1.0 / scale);
     let all = frame.rows(ROWS, margin(&start, (w, h)));
     let fit = |rows: &[Row], model: Model, focal: f64, from: &Tsf, iterations: usize| {
+        let iterations = if search.is_stopped() { 0 } else { iterations };
         Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
     };
     let block = w.max(h).div_ceil(BLOCKS);

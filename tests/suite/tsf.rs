@@ -71,7 +71,7 @@ fn shaken(latent: &Plane, pad: usize, truth: &Tsf, size: (usize, usize)) -> (Pla
 }
 
 fn search(model: Model, focal_px: Option<f64>) -> Search {
-    Search { model, focal_px }
+    Search { model, focal_px, stop: None }
 }
 
 #[test]

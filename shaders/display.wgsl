@@ -1,0 +1,186 @@
+// An irradiance image on the screen: exposure, tone curve, split, overlays.
+//
+// One fragment is one pixel of the screen. Where it lies in the frame follows from pan and zoom; what lies there is read straight from
+// the planes that the solver works on (f32 storage buffers, one per channel), so that nothing is copied for display. Left of the divider
+// picture A is shown, right of it picture B. The curve c and the colours are those of `tonemap::Operator::apply`, value for value:
+// luminance Y shows as c(gain Y), colours keep their ratios to Y and pale where the screen cannot hold them.
+
+struct Picture {
+    size: vec2u,     // pixels of the picture, without pad; 0: none
+    stride: u32,     // values per row of the planes
+    first: u32,      // index of the picture's first value
+}
+
+struct Params {
+    matrix: array<vec4f, 3>, // columns: the frames' RGB to Rec. 709
+    origin: vec2f,   // pixel of the screen at the view's corner
+    pan: vec2f,      // point of the frame there, pixels of the full frame
+    frame: vec2f,    // full frame, pixels
+    per_pixel: f32,  // pixels of the frame per pixel of the screen
+    split: f32,      // divider, pixels of the screen from the view's corner
+    gain: f32,
+    white: f32,
+    saturation: f32,
+    filmic: u32,
+    a: Picture,
+    b: Picture,
+    overlay: Picture,
+    overlay_kind: u32, // 0 none, 1 mask, 2 residual, 3 clipped
+    extremes: u32,     // 1: show what the curve makes white or black
+    encoded: u32,      // 1: the target takes sRGB codes; 0: it encodes by itself
+    background: f32,   // sRGB code beyond the frame
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> a_red: array<f32>;
+@group(0) @binding(2) var<storage, read> a_green: array<f32>;
+@group(0) @binding(3) var<storage, read> a_blue: array<f32>;
+@group(0) @binding(4) var<storage, read> b_red: array<f32>;
+@group(0) @binding(5) var<storage, read> b_green: array<f32>;
+@group(0) @binding(6) var<storage, read> b_blue: array<f32>;
+@group(0) @binding(7) var<storage, read> overlay: array<f32>;
+
+@vertex
+fn corners(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
+    // One triangle that covers the view.
+    return vec4f(f32(i32(i & 1u) * 4 - 1), f32(i32(i >> 1u) * 4 - 1), 0.0, 1.0);
+}
+
+fn value(left: bool, p: vec2i) -> vec3f {
+    var picture = params.b;
+    if left {
+        picture = params.a;
+    }
+    let q = vec2u(clamp(p, vec2i(0), vec2i(picture.size) - 1));
+    let i = picture.first + q.y * picture.stride + q.x;
+    if left {
+        return vec3f(a_red[i], a_green[i], a_blue[i]);
+    }
+    return vec3f(b_red[i], b_green[i], b_blue[i]);
+}
+
+// Irradiance at `q` (pixels of the frame, the first centre at 0.5): the mean where the screen is coarser than the picture, the pixel where
+// it is finer, between pixels where the picture is a reduced one.
+fn irradiance(left: bool, q: vec2f) -> vec3f {
+    let size = vec2f(select(params.b.size, params.a.size, left));
+    let scale = size / params.frame;
+    let step = params.per_pixel * scale.x;
+    let p = q * scale;
+    if step > 1.001 {
+        let n = i32(min(ceil(step), 4.0));
+        var sum = vec3f(0.0);
+        for (var j = 0; j < n; j++) {
+            for (var i = 0; i < n; i++) {
+                let at = p + step * ((vec2f(f32(i), f32(j)) + 0.5) / f32(n) - 0.5);
+                sum += value(left, vec2i(floor(at)));
+            }
+        }
+        return sum / f32(n * n);
+    }
+    if scale.x > 0.99 {
+        return value(left, vec2i(floor(p)));
+    }
+    let c = p - 0.5;
+    let f = fract(c);
+    let i = vec2i(floor(c));
+    let upper = mix(value(left, i), value(left, i + vec2i(1, 0)), f.x);
+    let lower = mix(value(left, i + vec2i(0, 1)), value(left, i + vec2i(1, 1)), f.x);
+    return mix(upper, lower, f.y);
+}
+
+fn hable(x: f32) -> f32 {
+    return (x * (0.22 * x + 0.03) + 0.002) / (x * (0.22 * x + 0.3) + 0.06) - 0.002 / 0.06;
+}
+
+fn shown(luminance: f32) -> f32 {
+    let v = min(luminance * params.gain, 1e12);
+    if params.filmic == 1u {
+        return hable(2.0 * min(v, params.white)) / hable(2.0 * params.white);
+    }
+    return v * (1.0 + v / (params.white * params.white)) / (1.0 + v);
+}
+
+fn encode(v: vec3f) -> vec3f {
+    let x = clamp(v, vec3f(0.0), vec3f(1.0));
+    return select(1.055 * pow(x, vec3f(1.0 / 2.4)) - 0.055, 12.92 * x, x <= vec3f(0.0031308));
+}
+
+fn decode(v: vec3f) -> vec3f {
+    return select(pow((v + 0.055) / 1.055, vec3f(2.4)), v / 12.92, v <= vec3f(0.04045));
+}
+
+// Linear Rec. 709 for the screen, 1 is white; w is 1 where the curve ends at white, -1 where it ends at black.
+fn tone(linear: vec3f) -> vec4f {
+    let own = max(params.matrix[0].xyz * linear.r + params.matrix[1].xyz * linear.g + params.matrix[2].xyz * linear.b, vec3f(0.0));
+    let y = dot(own, vec3f(0.2126, 0.7152, 0.0722));
+    let s = shown(y);
+    if !(y > 0.0 && s > 0.0) {
+        return vec4f(0.0, 0.0, 0.0, -1.0);
+    }
+    var ratio = own / y;
+    if params.saturation != 1.0 {
+        ratio = pow(ratio, vec3f(params.saturation));
+    }
+    var rgb = min(s, 4.0) * ratio;
+    let brightest = max(rgb.r, max(rgb.g, rgb.b));
+    if brightest > 1.0 {
+        let grey = min(s, 1.0);
+        var keep = 0.0;
+        if brightest > grey {
+            keep = (1.0 - grey) / (brightest - grey);
+        }
+        rgb = grey + (rgb - grey) * keep;
+    }
+    var end = 0.0;
+    if s >= 0.999 {
+        end = 1.0;
+    } else if s < 0.0003 {
+        end = -1.0;
+    }
+    return vec4f(rgb, end);
+}
+
+// Black, violet, orange, yellow: order in lightness survives a print in grey.
+fn heat(t: f32) -> vec3f {
+    let u = clamp(t, 0.0, 1.0);
+    return vec3f(clamp(1.7 * u, 0.0, 1.0), clamp(1.9 * u - 0.8, 0.0, 1.0), clamp(0.9 * sin(3.1 * u), 0.0, 0.6));
+}
+
+@fragment
+fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
+    let at = position.xy - params.origin;
+    let q = params.pan + at * params.per_pixel;
+    let left = at.x < params.split;
+    let size = select(params.b.size, params.a.size, left);
+    var code = vec3f(params.background);
+    if all(q >= vec2f(0.0)) && all(q < params.frame) && size.x > 0u {
+        let toned = tone(irradiance(left, q));
+        code = encode(toned.xyz);
+        if params.extremes == 1u && toned.w > 0.5 {
+            code = vec3f(0.9, 0.1, 0.1);
+        }
+        if params.extremes == 1u && toned.w < -0.5 {
+            code = vec3f(0.15, 0.3, 0.95);
+        }
+        if params.overlay_kind > 0u && params.overlay.size.x > 0u {
+            let o = params.overlay;
+            let p = vec2u(clamp(floor(q * vec2f(o.size) / params.frame), vec2f(0.0), vec2f(o.size) - 1.0));
+            let v = overlay[o.first + p.y * o.stride + p.x];
+            if params.overlay_kind == 1u {
+                // What does not count is red.
+                code = mix(code, vec3f(0.85, 0.1, 0.15), 0.75 * (1.0 - v));
+            } else if params.overlay_kind == 2u {
+                // chi squared: 1 is what noise explains, 16 is bright.
+                code = mix(code * 0.25, heat(0.25 * log2(max(v, 1.0))), step(1.0, v));
+            } else if v > 0.5 {
+                // Stripes, as cameras show it.
+                let stripe = step(0.5, fract((at.x + at.y) / 12.0));
+                code = mix(code, vec3f(0.95, 0.75, 0.1), 0.35 + 0.5 * stripe);
+            }
+        }
+    }
+    if params.encoded == 1u {
+        return vec4f(code, 1.0);
+    }
+    return vec4f(decode(code), 1.0);
+}

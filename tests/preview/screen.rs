@@ -1,0 +1,62 @@
+use super::support::{Times, frames};
+use std::process::{Child, Command, Stdio};
+
+/// A virtual screen, which ends with this.
+struct Screen {
+    server: Child,
+    name: String,
+}
+
+impl Screen {
+    fn open() -> Self {
+        use std::io::BufRead;
+        // The server chooses a free number and tells it.
+        let mut server = Command::new("Xvfb")
+            .args(["-displayfd", "1", "-screen", "0", "1100x760x24", "-nolisten", "tcp"])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("Xvfb; ./setup installs it");
+        let mut line = String::new();
+        std::io::BufReader::new(server.stdout.take().expect("piped")).read_line(&mut line).expect("a number");
+        Self { server, name: format!(":{}", line.trim()) }
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        let _ = self.server.kill();
+        let _ = self.server.wait();
+    }
+}
+
+#[test]
+fn a_real_window_shows_the_loaded_result_and_saves_its_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = frames(folder.path(), Times::Exif);
+    let screen = Screen::open();
+    let picture = folder.path().join("window.png");
+    let mut program = Command::new(env!("CARGO_BIN_EXE_unshaken"));
+    program.args(["preview", "--size", "1000x700", "--theme", "dark", "--screenshot"]).arg(&picture).args(&files);
+    program.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").env("XDG_STATE_HOME", folder.path());
+    let run = program.output().unwrap();
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let shown = image::open(&picture).unwrap().into_rgb8();
+    assert_eq!((shown.width(), shown.height()), (1000, 700));
+    // The room is lit: the middle of the window holds a picture of many colours, not a grey field.
+    let middle = image::imageops::crop_imm(&shown, 150, 150, 400, 250).to_image();
+    let colours: std::collections::BTreeSet<[u8; 3]> = middle.pixels().map(|p| p.0).collect();
+    assert!(colours.len() > 500, "{} colours", colours.len());
+    if let Some(folder) = std::env::var_os("UNSHAKEN_PICTURES") {
+        std::fs::copy(&picture, std::path::Path::new(&folder).join("screen.png")).unwrap();
+    }
+}
+
+#[test]
+fn without_a_screen_the_message_says_so() {
+    let run =
+        Command::new(env!("CARGO_BIN_EXE_unshaken")).arg("preview").env_remove("DISPLAY").env_remove("WAYLAND_DISPLAY").output().unwrap();
+    assert_eq!(run.status.code(), Some(1));
+    let said = String::from_utf8_lossy(&run.stderr).into_owned();
+    assert!(said.contains("the window cannot be opened") && said.lines().count() == 1, "{said}");
+}
