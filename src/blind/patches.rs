@@ -96,9 +96,13 @@ pub fn from_patches(
     let within = tsf::align_within(&seen, &grid, w, h).ok_or(Lack::Texture(reference))?;
     let mut tsfs = vec![within.tsf.clone(); frames.len()];
     let mut psfs: Vec<Vec<(Patch, Psf)>> = vec![Vec::new(); frames.len()];
-    psfs[reference] = seen.iter().zip(&within.shifts).map(|((p, h), s)| (*p, tsf::shifted(h, *s))).collect();
+    let moved = |psfs: &[(Patch, Psf)], shifts: &[(f64, f64)]| -> Vec<(Patch, Psf)> {
+        psfs.iter().zip(shifts).map(|((p, h), s)| (*p, tsf::shifted(h, *s))).collect()
+    };
+    psfs[reference] = moved(&seen, &within.shifts);
     for ((&k, own), joint) in partners.iter().zip(&of_partner).zip(&both) {
-        let (aligned, _) = tsf::align_across(own, &within.tsf, (&frames[reference].blurred, &frames[k].blurred), joint);
+        let shifts = tsf::align_across(own, &within.tsf, (&frames[reference].blurred, &frames[k].blurred), joint);
+        let aligned = moved(own, &shifts);
         tsfs[k] = tsf::from_psfs(&aligned, &grid, w, h).ok_or(Lack::Texture(k))?;
         psfs[k] = aligned;
     }

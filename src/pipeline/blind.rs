@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::merge;
+use crate::psf::{Patch, Psf};
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
 use glam::DMat3;
@@ -134,7 +135,7 @@ impl Run<'_> {
             }
         };
         let psfs = |k: usize| {
-            let one = |(p, h): &(crate::psf::Patch, crate::psf::Psf)| json!({ "x": p.x, "y": p.y, "size": p.size, "radius": h.radius, "values": h.values.data });
+            let one = |(p, h): &(Patch, Psf)| json!({ "x": p.x, "y": p.y, "size": p.size, "radius": h.radius, "values": h.values.data });
             json!({ "frame": name(k), "psfs": found.psfs[k].iter().map(one).collect::<Vec<_>>() })
         };
         self.blind = json!({

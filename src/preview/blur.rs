@@ -70,13 +70,13 @@ struct Grid {
 }
 
 /// White where `values` are largest, see-through where they are 0.
-fn glyph(values: &[f32], side: usize) -> egui::ColorImage {
+fn glyph(values: &[f32], size: [usize; 2]) -> egui::ColorImage {
     let most = values.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
     let pixels = values.iter().map(|v| {
         let a = (v / most).clamp(0.0, 1.0).powf(0.6);
         Color32::from_rgba_unmultiplied(255, (190.0 + 65.0 * a) as u8, (60.0 + 180.0 * a) as u8, (255.0 * a) as u8)
     });
-    egui::ColorImage::new([side, side], pixels.collect())
+    egui::ColorImage::new(size, pixels.collect())
 }
 
 /// The PSF that `tsf` makes at the frame's pixel `p` (centred pixels): square of side 2 · radius + 1, bilinear.
@@ -119,9 +119,7 @@ fn glyphs(app: &App, ctx: &egui::Context, solved: &Solved, frame: usize) -> Glyp
                 }
             }
         }
-        let mut picture = glyph(&all.data, 1);
-        picture.size = [all.width, all.height];
-        let texture = ctx.load_texture("PSF grid", picture, smooth);
+        let texture = ctx.load_texture("PSF grid", glyph(&all.data, [all.width, all.height]), smooth);
         Grid { texture, cells: (COLUMNS, rows), across: side as f32 * scale }
     });
     let none = Vec::new();
@@ -134,7 +132,7 @@ fn glyphs(app: &App, ctx: &egui::Context, solved: &Solved, frame: usize) -> Glyp
         Some(Glyph {
             corner: Vec2::new(number("x")? as f32, number("y")? as f32) * scale,
             side: number("size")? as f32 * scale,
-            texture: ctx.load_texture("PSF", glyph(&values, side), smooth),
+            texture: ctx.load_texture("PSF", glyph(&values, [side, side]), smooth),
             across: side as f32 * scale,
             confidence: number("confidence")?,
             extent: p["psf"]["extent_px"].as_f64()? * f64::from(scale),

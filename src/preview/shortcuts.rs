@@ -101,29 +101,43 @@ pub fn pressed(ctx: &egui::Context) -> Vec<Action> {
 
 /// How the key of an action is written on this system.
 pub fn name(ctx: &egui::Context, action: Action) -> String {
-    KEYS.iter().find(|k| k.1 == action).map(|k| ctx.format_shortcut(&k.0)).unwrap_or_default()
+    KEYS.iter().find(|k| k.1 == action).map(|k| written(ctx, &k.0)).unwrap_or_default()
+}
+
+/// A key as it stands on a keyboard.
+fn written(ctx: &egui::Context, key: &KeyboardShortcut) -> String {
+    let mut text = ctx.format_shortcut(key);
+    for (name, sign) in [("Plus", "+"), ("Minus", "-"), ("CloseBracket", "]"), ("OpenBracket", "["), ("Questionmark", "?")] {
+        text = text.replace(name, sign);
+    }
+    text
 }
 
 /// The help sheet.
 pub fn sheet(ctx: &egui::Context, open: &mut bool) {
-    egui::Window::new("Keyboard shortcuts").open(open).resizable(false).collapsible(false).show(ctx, |ui| {
-        egui::Grid::new("keys").num_columns(2).spacing([24.0, 4.0]).striped(true).show(ui, |ui| {
-            for (key, _, text) in KEYS {
-                ui.monospace(ctx.format_shortcut(key));
-                ui.label(*text);
-                ui.end_row();
-            }
-            for (what, text) in [
-                ("Wheel, pinch", "Zoom"),
-                ("Drag", "Pan; in the blur view, move a patch"),
-                ("Double click", "Actual pixels, or the whole frame"),
-                ("Click", "In the blur view, add a patch"),
-                ("Right click", "In the blur view, remove a patch"),
-            ] {
-                ui.monospace(what);
-                ui.label(text);
-                ui.end_row();
-            }
+    egui::Window::new("Keyboard shortcuts")
+        .open(open)
+        .resizable(false)
+        .collapsible(false)
+        .anchor(egui::Align2::CENTER_CENTER, [0.0, 0.0])
+        .show(ctx, |ui| {
+            egui::Grid::new("keys").num_columns(2).spacing([24.0, 4.0]).striped(true).show(ui, |ui| {
+                for (key, _, text) in KEYS {
+                    ui.monospace(written(ctx, key));
+                    ui.label(*text);
+                    ui.end_row();
+                }
+                for (what, text) in [
+                    ("Wheel, pinch", "Zoom"),
+                    ("Drag", "Pan; in the blur view, move a patch"),
+                    ("Double click", "Actual pixels, or the whole frame"),
+                    ("Click", "In the blur view, add a patch"),
+                    ("Right click", "In the blur view, remove a patch"),
+                ] {
+                    ui.monospace(what);
+                    ui.label(text);
+                    ui.end_row();
+                }
+            });
         });
-    });
 }

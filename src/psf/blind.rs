@@ -120,7 +120,7 @@ fn simplex(h: &mut [f32]) {
 fn difference(a: &[f32], wide: usize, down: bool) -> Vec<f32> {
     let n = a.len();
     let step = if down { wide } else { 1 };
-    let inside = |p: usize| if down { p + wide < n } else { (p + 1) % wide > 0 };
+    let inside = |p: usize| if down { p + wide < n } else { !(p + 1).is_multiple_of(wide) };
     (0..n).map(|p| if inside(p) { a[p + step] - a[p] } else { 0.0 }).collect()
 }
 

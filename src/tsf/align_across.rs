@@ -2,7 +2,7 @@
 //! `‖h_l² * B_l^ref - h_l^ref * B_l²‖²` smallest, with `h_l^ref = M_l h_T^ref`.
 
 use super::Tsf;
-use super::align_within::{centred, psf_at, shifted};
+use super::align_within::{centred, psf_at};
 use super::taps::Interpolation;
 use crate::image::Plane;
 use crate::psf::{Patch, Psf};
@@ -22,23 +22,22 @@ pub fn blurred(plane: &Plane, h: &Psf) -> Plane {
     Plane::from_fn(plane.width, plane.height, |x, y| taps.iter().map(|&(u, v, w)| w * plane.clamped(x as isize - u, y as isize - v)).sum())
 }
 
-/// The PSFs of one frame, `frame`, moved so that they agree with the TSF `reference` of the frame `reference_frame` (irradiances of one size; `weights`
-/// 0 where either is masked), and the shifts (x, y) in pixels, multiples of a half, that did it.
+/// Shifts (x, y) in pixels, multiples of a half, that make the PSFs of the frame `frame` agree with the TSF `reference` of the frame `reference_frame`
+/// (irradiances of one size; `weights` 0 where either is masked).
 pub fn align_across(
     psfs: &[(Patch, Psf)],
     reference: &Tsf,
     (reference_frame, frame): (&Plane, &Plane),
     weights: &Plane,
-) -> (Vec<(Patch, Psf)>, Vec<(f64, f64)>) {
+) -> Vec<(f64, f64)> {
     psfs.par_iter()
         .map(|(patch, h)| {
             let cut = |p: &Plane| p.crop(patch.x, patch.y, patch.size.min(p.width - patch.x), patch.size.min(p.height - patch.y));
             let there = psf_at(reference, centred(patch, frame.size()), h.radius);
             let (own, other, seen) = (blurred(&cut(reference_frame), h), blurred(&cut(frame), &there), cut(weights));
-            let shift = best_shift(&own, &other, &seen, h.radius);
-            ((*patch, shifted(h, shift)), shift)
+            best_shift(&own, &other, &seen, h.radius)
         })
-        .unzip()
+        .collect()
 }
 
 /// The shift s, whole pixels first, then half ones, that makes `‖own(y - s) - other(y)‖²` smallest, on x and y differences; away from the border by as much as
