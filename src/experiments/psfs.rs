@@ -125,8 +125,13 @@ pub(super) fn blind(lab: &mut Lab, events: Events) -> Result<Report> {
         text: format!(
             "Scene chart, {}; TSFs on the paper's grid. From the two longest frames alone, of which neither is sharp, the program finds the irradiance and both TSFs together; \
              the PSFs are eq. (5) of these. The paper estimates each patch by itself (eq. 12). Scene and PSFs may be shifted together without any change in the frames: \
-             each patch's pair of PSFs is compared after the one shift that suits both best. The error is the norm of the difference over the norm of the true PSF.",
-            study.camera
+             each patch's pair of PSFs is compared after the one shift that suits both best. The error is the norm of the difference over the norm of the true PSF.{}",
+            study.camera,
+            if found.report["blind"]["believed"].as_bool() == Some(true) {
+                ""
+            } else {
+                " The blurs were not found: the PSFs are those of a merge."
+            }
         ),
         table,
         picture: sheet::sheet(&all, 190),
