@@ -291,18 +291,7 @@ impl PhotoSettings {
             None => Operator::default(),
             Some(words) => Operator::parse(words).map_err(|e| Usage(format!("--tonemap: {e}")))?,
         };
-        let ending = output::ending(&args.output);
         let refuse = |option: &str, why: &str| Err(Usage(format!("{option}: {why}")));
-        match ending.as_str() {
-            "exr" | "tif" | "tiff" => {}
-            "hdr" if photo.half => return refuse("--half", "Radiance HDR has one depth; leave --half out"),
-            "hdr" if primaries != Primaries::Rec709 => return refuse("--primaries", "Radiance HDR is Rec. 709; write OpenEXR or TIFF"),
-            "hdr" => {}
-            _ => return refuse("--output", "the name ends with neither .exr, .hdr, .tif nor .tiff; name the format by the ending"),
-        }
-        if photo.layers && ending != "exr" {
-            return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
-        }
         if photo.tonemap.is_some() && args.preview.is_none() {
             return refuse("--tonemap", "is for the picture of --preview; name one");
         }
@@ -524,6 +513,25 @@ pub(super) struct Targets {
     page: Option<Output>,
 }
 
+/// Refuses what the format of the output, by its ending, cannot hold.
+fn check_format(args: &MergeArgs) -> Result<(), Usage> {
+    let photo = &args.photo;
+    let rec709 = photo.primaries.as_deref().is_none_or(|word| Primaries::named(word) == Some(Primaries::Rec709));
+    let ending = output::ending(&args.output);
+    let refuse = |option: &str, why: &str| Err(Usage(format!("{option}: {why}")));
+    match ending.as_str() {
+        "exr" | "tif" | "tiff" => {}
+        "hdr" if photo.half => return refuse("--half", "Radiance HDR has one depth; leave --half out"),
+        "hdr" if !rec709 => return refuse("--primaries", "Radiance HDR is Rec. 709; write OpenEXR or TIFF"),
+        "hdr" => {}
+        _ => return refuse("--output", "the name ends with neither .exr, .hdr, .tif nor .tiff; name the format by the ending"),
+    }
+    if photo.layers && ending != "exr" {
+        return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
+    }
+    Ok(())
+}
+
 pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
     inputs.extend(response_file.map(|p| ("response file", p)));
@@ -536,12 +544,15 @@ pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow:
     output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
     let check = |p: &PathBuf| Output::check(p, args.overwrite);
     let checked = |p: &Option<PathBuf>| p.as_ref().map(check).transpose();
-    Ok(Targets {
+    let targets = Targets {
         linear: check(&args.output)?,
         preview: checked(&args.preview)?,
         report: checked(&args.report)?,
         page: checked(&args.photo.report_html)?,
-    })
+    };
+    // A folder or an input first: its name says nothing of a format.
+    check_format(args)?;
+    Ok(targets)
 }
 
 pub(super) fn read_response(path: &Path) -> Result<Response, Error> {
