@@ -10,9 +10,9 @@ use glam::{DMat3, DVec2};
 /// Inverse-variance mean of f⁻¹(Z)/Δt over the frames `ids`, positive everywhere. Variances are those of the locally smoothed exposure: a
 /// pixel's own value would give more weight to what noise made darker.
 pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves: &[[Vec<f32>; 3]], ids: &[usize]) -> Rgb {
-    let (w, h) = bracket.size();
     let frames = bracket.frames();
     let shortest = bracket.shortest(ids).unwrap_or(0);
+    let (w, h) = exposures[shortest].size();
     let longest = ids.iter().map(|&i| frames[i].exposure_time).fold(0.0, f64::max) as f32;
     Rgb(std::array::from_fn(|c| {
         let smooth: Vec<Plane> = ids.iter().map(|&i| box_mean(&exposures[i].0[c], 2)).collect();
@@ -36,26 +36,28 @@ pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves:
     }))
 }
 
-/// `image` and its mask as seen from another grid of the same size, `motion` being the way from there to the image (centred pixels):
-/// bilinear; the mask is 0 beyond the image. Good for a start, not for the solution: it smooths.
-pub fn resampled(image: &Rgb, mask: &Plane, motion: &DMat3) -> (Rgb, Plane) {
+/// `image` and its mask as seen from another grid of the same size plus `pad` pixels on every side, `motion` being the way from there to
+/// the image (centred pixels): bilinear; the mask is 0 beyond the image. Good for a start, not for the solution: it smooths.
+pub fn resampled(image: &Rgb, mask: &Plane, motion: &DMat3, pad: usize) -> (Rgb, Plane) {
     let (w, h) = image.size();
+    let size = (w + 2 * pad, h + 2 * pad);
     let centre = DVec2::new(0.5 * (w as f64 - 1.0), 0.5 * (h as f64 - 1.0));
-    let mut out = image.clone();
-    let mut seen = mask.clone();
-    for y in 0..h {
-        for x in 0..w {
-            let q = project(motion, DVec2::new(x as f64, y as f64) - centre) + centre;
+    let pad = DVec2::splat(pad as f64);
+    let mut out = image.map_planes(|_| Plane::filled(size.0, size.1, 0.0));
+    let mut seen = Plane::filled(size.0, size.1, 0.0);
+    for y in 0..size.1 {
+        for x in 0..size.0 {
+            let q = project(motion, DVec2::new(x as f64, y as f64) - pad - centre) + centre;
             let (fx, fy) = (q.x.floor(), q.y.floor());
             let (u, v) = ((q.x - fx) as f32, (q.y - fy) as f32);
             let (i, j) = (fx as isize, fy as isize);
             for (o, p) in out.0.iter_mut().zip(&image.0) {
                 let at = |a: isize, b: isize| p.clamped(i + a, j + b);
-                o.data[y * w + x] = (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1));
+                o.data[y * size.0 + x] = (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1));
             }
             let inside = q.x >= 0.0 && q.y >= 0.0 && q.x <= w as f64 - 1.0 && q.y <= h as f64 - 1.0;
             let at = |a: isize, b: isize| mask.clamped(i + a, j + b);
-            seen.data[y * w + x] = if inside { at(0, 0).min(at(1, 0)).min(at(0, 1)).min(at(1, 1)) } else { 0.0 };
+            seen.data[y * size.0 + x] = if inside { at(0, 0).min(at(1, 0)).min(at(0, 1)).min(at(1, 1)) } else { 0.0 };
         }
     }
     (out, seen)

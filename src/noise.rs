@@ -69,11 +69,14 @@ const QUANTILE: f64 = 0.05;
 /// That quantile of the mean square of 64 samples of filtered white noise over its expectation (2·10⁴ simulated blocks).
 const QUANTILE_OF_NOISE: f64 = 0.554;
 
-/// Noise level of a bracket's frames, from the high-pass variance of their flattest blocks at each exposure.
+/// Noise level of a bracket's frames, from the high-pass variance of their flattest blocks at each exposure and of the flattest blocks of
+/// the differences between each frame and the next longer one.
 ///
 /// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes; blocks of all frames and
 /// channels are pooled, since shot and read noise depend on the exposure alone; blurred frames contribute most, as blur
-/// removes texture but not noise. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is usable.
+/// removes texture but not noise. Where two frames show the same scene in the same place, their difference has no texture left; where they
+/// do not, it has more, and texture never lowers a variance. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is
+/// usable.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
     let at_lag = |lag| fit(&samples(frames, exposures, response, lag));
     match (at_lag(1), at_lag(COARSE_LAG)) {
@@ -92,28 +95,66 @@ const CORRELATED: f64 = 2.5;
 /// Exposures at which they are compared.
 const MID_EXPOSURES: [f64; 2] = [0.02, 0.2];
 
-/// (exposure, variance, number of blocks) of bins of equal population along the exposure, none wider than a factor of 1.5.
-fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<(f64, f64, f64)> {
-    let mut blocks: Vec<(f64, f64)> = Vec::new();
-    for (frame, x) in frames.iter().zip(exposures) {
+/// Variance of what was looked at, and what the noise model says of it: `variance = shot · shots + read · reads`.
+#[derive(Clone, Copy)]
+struct Sample {
+    exposure: f64,
+    shots: f64,
+    reads: f64,
+    variance: f64,
+    blocks: f64,
+}
+
+/// One channel of a frame, or of a frame less `ratio` times the next longer one.
+struct Source<'a> {
+    intensity: &'a Plane,
+    exposure: &'a Plane,
+    less: Option<(&'a Plane, &'a Plane, f64)>,
+}
+
+/// Samples of all frames and of all differences.
+fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<Sample> {
+    let source = |i: usize, c: usize| Source { intensity: &frames[i].intensity.0[c], exposure: &exposures[i].0[c], less: None };
+    let mut alone: Vec<Sample> = Vec::new();
+    for (i, frame) in frames.iter().enumerate() {
         for c in 0..3 {
-            let quantum = quantisation(response, c, frame.levels);
-            collect_blocks(&frame.intensity.0[c], &x.0[c], lag, &quantum, &mut blocks);
+            collect_blocks(&source(i, c), lag, &quantisation(response, c, frame.levels), &mut alone);
         }
     }
-    blocks.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut found = bins(alone);
+    let mut order: Vec<usize> = (0..frames.len()).collect();
+    order.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
+    for pair in order.windows(2) {
+        let (i, j) = (pair[0], pair[1]);
+        let ratio = frames[i].exposure_time / frames[j].exposure_time;
+        let mut differences: Vec<Sample> = Vec::new();
+        for c in 0..3 {
+            let less = Some((&frames[j].intensity.0[c], &exposures[j].0[c], ratio));
+            let levels = frames[i].levels.min(frames[j].levels);
+            collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels), &mut differences);
+        }
+        found.extend(bins(differences));
+    }
+    found
+}
+
+/// Low quantiles of bins of equal population along the exposure, none wider than a factor of 1.5.
+fn bins(mut blocks: Vec<Sample>) -> Vec<Sample> {
+    blocks.sort_by(|a, b| a.exposure.total_cmp(&b.exposure));
     let mut samples = Vec::new();
     let mut i = 0;
     while i < blocks.len() {
-        let end = blocks[i..].partition_point(|b| b.0 <= 1.5 * blocks[i].0) + i;
+        let end = blocks[i..].partition_point(|b| b.exposure <= 1.5 * blocks[i].exposure) + i;
         let end = end.min(i + (blocks.len() / 40).max(200));
         if end - i >= 60 {
-            let mut v: Vec<f64> = blocks[i..end].iter().map(|b| b.1).collect();
+            let part = &blocks[i..end];
+            let mut v: Vec<f64> = part.iter().map(|b| b.variance).collect();
             v.sort_by(f64::total_cmp);
-            let x = blocks[i..end].iter().map(|b| b.0).sum::<f64>() / (end - i) as f64;
-            let q = v[(QUANTILE * v.len() as f64) as usize] / QUANTILE_OF_NOISE;
-            if q > 0.0 {
-                samples.push((x, q, (end - i) as f64));
+            let mean = |f: fn(&Sample) -> f64| part.iter().map(f).sum::<f64>() / part.len() as f64;
+            let variance = v[(QUANTILE * v.len() as f64) as usize] / QUANTILE_OF_NOISE;
+            if variance > 0.0 {
+                let (exposure, shots, reads) = (mean(|b| b.exposure), mean(|b| b.shots), mean(|b| b.reads));
+                samples.push(Sample { exposure, shots, reads, variance, blocks: part.len() as f64 });
             }
         }
         i = end;
@@ -121,27 +162,43 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
     samples
 }
 
-/// Appends (mean exposure, high-pass variance) of the blocks of one channel that no clipping touches.
-fn collect_blocks(z: &Plane, x: &Plane, lag: usize, quantum: &impl Fn(f64) -> f64, blocks: &mut Vec<(f64, f64)>) {
-    let (w, h) = x.size();
+/// Appends the high-pass variance of the blocks that no clipping touches.
+fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64, blocks: &mut Vec<Sample>) {
+    let (w, h) = source.exposure.size();
+    let unclipped = |z: &Plane, i: usize, j: usize| z.at(i, j) > 0.0 && z.at(i, j) < 0.95;
     for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
         for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
-            let around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
-            if !around.into_iter().all(|(i, j)| z.at(i, j) > 0.0 && z.at(i, j) < 0.95) {
+            let mut around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
+            let usable = |(i, j): (usize, usize)| unclipped(source.intensity, i, j) && source.less.is_none_or(|l| unclipped(l.0, i, j));
+            if !around.all(usable) {
                 continue;
             }
+            let value = |x: usize, y: usize| {
+                let own = f64::from(source.exposure.at(x, y));
+                source.less.map_or(own, |(_, longer, ratio)| own - ratio * f64::from(longer.at(x, y)))
+            };
             let (mut sum, mut square) = (0.0, 0.0);
             for j in by..by + BLOCK {
                 for i in bx..bx + BLOCK {
-                    let at = |dx: usize, dy: usize| f64::from(x.at(i + dx * lag - lag, j + dy * lag - lag));
+                    let at = |dx: usize, dy: usize| value(i + dx * lag - lag, j + dy * lag - lag);
                     let corners = at(0, 0) + at(2, 0) + at(0, 2) + at(2, 2);
                     let sides = at(1, 0) + at(0, 1) + at(2, 1) + at(1, 2);
                     square += (corners - 2.0 * sides + 4.0 * at(1, 1)).powi(2) / 36.0;
-                    sum += at(1, 1);
+                    sum += f64::from(source.exposure.at(i, j));
                 }
             }
             let n = (BLOCK * BLOCK) as f64;
-            blocks.push((sum / n, (square / n - quantum(sum / n)).max(0.0)));
+            let (exposure, square) = (sum / n, square / n);
+            // The longer frame has 1/ratio times the exposure, and its variance counts ratio² times.
+            let ratio = source.less.map_or(0.0, |l| l.2);
+            let rounding = quantum(exposure) + if ratio > 0.0 { ratio * ratio * quantum(exposure / ratio) } else { 0.0 };
+            blocks.push(Sample {
+                exposure,
+                shots: exposure * (1.0 + ratio),
+                reads: 1.0 + ratio * ratio,
+                variance: (square - rounding).max(0.0),
+                blocks: 1.0,
+            });
         }
     }
 }
@@ -150,16 +207,16 @@ fn collect_blocks(z: &Plane, x: &Plane, lag: usize, quantum: &impl Fn(f64) -> f6
 const BELOW: f64 = 0.15;
 
 /// Quantile regression of variance = shot · x + read in logarithms, by search over both parameters, each step finer.
-fn fit(samples: &[(f64, f64, f64)]) -> Option<NoiseModel> {
+fn fit(samples: &[Sample]) -> Option<NoiseModel> {
     if samples.is_empty() {
         return None;
     }
     let loss = |shot: f64, read: f64| -> f64 {
         samples
             .iter()
-            .map(|&(x, v, n)| {
-                let r = (v / (shot * x + read)).ln();
-                n * if r > 0.0 { BELOW * r } else { (BELOW - 1.0) * r }
+            .map(|s| {
+                let r = (s.variance / (shot * s.shots + read * s.reads)).ln();
+                s.blocks * if r > 0.0 { BELOW * r } else { (BELOW - 1.0) * r }
             })
             .sum()
     };

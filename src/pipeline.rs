@@ -80,10 +80,13 @@ impl Settings {
     /// The same for frames whose sides are divided by `divisor`: lengths in pixels shrink with them.
     #[must_use]
     pub fn reduced(&self, divisor: usize) -> Self {
+        let squares = (divisor * divisor) as f64;
         Self {
             focal_px: self.focal_px.map(|f| f / divisor as f64),
             patches: self.patches.iter().map(|&(x, y)| (x / divisor, y / divisor)).collect(),
             psf_radius: self.psf_radius.map(|r| r.div_ceil(divisor)),
+            // Means of squares of pixels have less noise than the pixels.
+            noise: self.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares }),
             ..self.clone()
         }
     }
@@ -129,6 +132,13 @@ pub struct Outcome {
     pub reference: usize,
     /// Names of frames that the program, not the user, left out, and why.
     pub left_out: Vec<(String, String)>,
+    /// Why the result is less than was asked for, a sentence each: frames that had to be left out, and a merge where nothing could be
+    /// deblurred. Empty where all is as it should be.
+    pub degraded: Vec<String>,
+    /// Each frame's place: the motion from the reference frame, centred pixels; of shaken frames that of their mean pose.
+    pub places: Vec<DMat3>,
+    /// Masks m by which the frames counted, eq. (8), each on its own pixels.
+    pub masks: Vec<Plane>,
     /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
     pub misfit: Vec<Option<Plane>>,
     /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
@@ -146,6 +156,8 @@ const HOPELESS: f64 = 8.0;
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
 const SHARP_OUTER: usize = 3;
+/// The same where frames are displaced: the start was resampled, which smooths, and the residual-driven weights come late.
+const DISPLACED_OUTER: usize = 8;
 /// Outer iterations of the rounds before the last.
 const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
@@ -170,6 +182,7 @@ struct Run<'a> {
     motions: Vec<DMat3>,
     registrations: Vec<Registration>,
     left_out: Vec<(String, String)>,
+    degraded: Vec<String>,
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
     blind: Value,
@@ -236,6 +249,7 @@ pub fn merge_with(
         motions,
         registrations: vec![Registration::skipped(); frames.len()],
         left_out: Vec::new(),
+        degraded: Vec::new(),
         events,
         timings: Vec::new(),
         blind: Value::Null,
@@ -277,6 +291,12 @@ impl Run<'_> {
     fn warn(&mut self, text: String) -> Result<()> {
         self.memo.hear(&text);
         if (self.events)(Event::Warning(text)) { Ok(()) } else { Err(Error::Cancelled) }
+    }
+
+    /// A warning of a result that is less than was asked for.
+    fn degrade(&mut self, text: String) -> Result<()> {
+        self.degraded.push(text.clone());
+        self.warn(text)
     }
 
     fn timed<T>(&mut self, what: &str, f: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
@@ -328,7 +348,7 @@ impl Run<'_> {
     /// A frame is left out because of what was found about it.
     fn leave_out(&mut self, i: usize, why: &str) -> Result<()> {
         let name = self.bracket.frames()[i].name.clone();
-        self.warn(format!("{name}: {why}; it is left out"))?;
+        self.degrade(format!("{name}: {why}; it is left out"))?;
         self.left_out.push((name, why.into()));
         Ok(())
     }
@@ -417,16 +437,24 @@ impl Run<'_> {
         let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
         let verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
             self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
-            let (verdicts, found, motions, registrations, left_out) = self.remembered(
+            let (verdicts, found, motions, registrations, left_out, degraded) = self.remembered(
                 "registration",
                 "",
                 |_| 0,
                 |run| {
                     let verdicts = run.align(verdicts, &mut excluded, &known)?;
-                    Ok((verdicts, excluded.clone(), run.motions.clone(), run.registrations.clone(), run.left_out.clone()))
+                    Ok((
+                        verdicts,
+                        excluded.clone(),
+                        run.motions.clone(),
+                        run.registrations.clone(),
+                        run.left_out.clone(),
+                        run.degraded.clone(),
+                    ))
                 },
             )?;
-            (excluded, self.motions, self.registrations, self.left_out) = (found, motions, registrations, left_out);
+            (excluded, self.motions, self.registrations) = (found, motions, registrations);
+            (self.left_out, self.degraded) = (left_out, degraded);
             verdicts
         } else {
             self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
@@ -445,22 +473,24 @@ impl Run<'_> {
         // Where no frame shows the scene: what to start from instead.
         let mut scene: Option<Rgb> = None;
         let mut centre: Option<usize> = None;
-        let forced = self.settings.blind == Blind::Joint && given.is_none();
+        let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
+        let doubtful =
+            given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto && blind::doubtful(&verdicts, &sharp);
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
-            self.warn("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
-        } else if forced || (!all_known && !sharp.contains(&true)) {
-            let (found, motions, blind) = self.remembered(
+            self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
+        } else if forced || doubtful || (!all_known && !sharp.contains(&true)) {
+            let (found, motions, blind, degraded) = self.remembered(
                 "all blurs",
                 "",
                 |_| 0,
                 |run| {
-                    let found = run.joint(&used, 0.03, 0.60)?;
-                    Ok((found, run.motions.clone(), run.blind.clone()))
+                    let found = run.all_blurs(&used, doubtful, 0.03, 0.60)?;
+                    Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
                 },
             )?;
-            (self.motions, self.blind) = (motions, blind);
+            (self.motions, self.blind, self.degraded) = (motions, blind, degraded);
             match found {
                 Some(found) => {
                     scene = Some(found.start);
@@ -470,7 +500,7 @@ impl Run<'_> {
                         tsfs[i] = Some(tsf);
                     }
                 }
-                None => unexplained = true,
+                None => unexplained = !doubtful,
             }
         } else if !sharp.contains(&true) {
             scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);
@@ -501,17 +531,20 @@ impl Run<'_> {
         // The sharp frames alone: start of the solver, reference of the PSFs, and the result when nothing else helps.
         let start_frames = if still.is_empty() { shaken.clone() } else { still.clone() };
         self.progress("merging the sharp frames", 0.03)?;
-        let initial = self.start(&start_frames);
+        let (initial, _) = self.start(&start_frames, 0);
         for &i in &still {
             tsfs[i] = Some(Tsf::still(self.motions[i]));
         }
+        let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
         // Without blur an iteration costs next to nothing: this solution may converge.
-        let alone = deblur::Settings { outer: SHARP_OUTER, ..self.settings.deblur.clone() };
+        let alone = deblur::Settings {
+            outer: if start_frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { DISPLACED_OUTER } else { SHARP_OUTER },
+            ..self.settings.deblur.clone()
+        };
         let first = if shaken.is_empty() { alone.clone() } else { for_estimates(&alone) };
         let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
-        let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
-        let initial = initial.map_planes(|p| p.padded(pad));
+        let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
         let base = self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
         let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
@@ -547,8 +580,11 @@ impl Run<'_> {
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
             let pad = deblur::pad_for(&known, w, h, limit);
             let from = match (&solution, &scene) {
-                (None, Some(scene)) => scene.map_planes(|p| p.padded(pad)),
-                (found, _) => found.as_ref().unwrap_or(&base).with_pad(pad),
+                (None, Some(scene)) => self.surrounded(scene, 0, pad, &still, &shaken),
+                (found, _) => {
+                    let found = found.as_ref().unwrap_or(&base);
+                    self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken)
+                }
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
@@ -634,20 +670,41 @@ impl Run<'_> {
         Ok(solved)
     }
 
-    /// Merge of the frames `ids` on the reference's grid, to start from.
-    fn start(&self, ids: &[usize]) -> Rgb {
-        if ids.iter().all(|&i| self.motions[i] == DMat3::IDENTITY) {
-            return merge::irradiance(self.bracket, &self.exposures, &self.masks, &self.curves, ids);
-        }
+    /// Merge of the frames `ids`, placed but not deblurred, on the reference's grid plus `pad` pixels on every side, and where any of
+    /// them is not masked.
+    fn start(&self, ids: &[usize], pad: usize) -> (Rgb, Plane) {
         let seen = (0..self.exposures.len()).map(|i| {
-            if ids.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i])
+            if ids.contains(&i) && (pad > 0 || self.motions[i] != DMat3::IDENTITY) {
+                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i], pad)
             } else {
                 (self.exposures[i].clone(), self.masks[i].clone())
             }
         });
         let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = seen.unzip();
-        merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids)
+        let merged = merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids);
+        let (w, h) = merged.size();
+        (merged, Plane::from_fn(w, h, |x, y| ids.iter().map(|&i| masks[i].data[y * w + x]).fold(0.0, f32::max)))
+    }
+
+    /// `image`, which lies on the reference's grid plus `own` pixels on every side, on that plus `pad` pixels. What it lacks is what
+    /// the frames show that see it: the sharp ones, where none the others; and beyond all of them the nearest pixel.
+    fn surrounded(&self, image: &Rgb, own: usize, pad: usize, still: &[usize], shaken: &[usize]) -> Rgb {
+        let (w, h) = self.bracket.size();
+        let nearest = |x: usize, y: usize| ((x + own) as isize - pad as isize, (y + own) as isize - pad as isize);
+        let displaced = |ids: &[usize]| -> Option<(Rgb, Plane)> {
+            let moved = ids.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+            (pad > own && moved).then(|| self.start(ids, pad))
+        };
+        let around = [displaced(still), displaced(shaken)];
+        let within = |a: isize, n: usize| a >= 0 && (a as usize) < n + 2 * own;
+        Rgb(std::array::from_fn(|c| {
+            Plane::from_fn(w + 2 * pad, h + 2 * pad, |x, y| {
+                let (i, j) = nearest(x, y);
+                let beyond = !(within(i, w) && within(j, h));
+                let other = around.iter().flatten().find(|(_, seen)| beyond && seen.data[y * seen.width + x] > 0.0);
+                other.map_or_else(|| image.0[c].clamped(i, j), |(shown, seen)| shown.0[c].data[y * seen.width + x])
+            })
+        }))
     }
 
     /// Mean squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred.
@@ -656,7 +713,7 @@ impl Run<'_> {
         let (seen, inside) = if self.motions[i] == DMat3::IDENTITY {
             (latent.clone(), mask.clone())
         } else {
-            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse())
+            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse(), 0)
         };
         let mask = mask.zip(&inside, |m, k| m * k);
         merge::misfit(&seen, exposure, &mask, &self.curves[i], self.bracket.frames()[i].exposure_time)
@@ -703,7 +760,7 @@ impl Run<'_> {
         let (tsf, mut detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, latent)))?;
         if let Some(tsf) = &tsf {
             let own = format!("{own} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
-            detail["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.patches(i, latent, tsf)))?;
+            detail["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, latent, tsf)))?;
         }
         Ok((tsf, detail))
     }
@@ -731,7 +788,7 @@ impl Run<'_> {
     }
 
     /// Patches of frame `i` and their PSFs, as the report has them.
-    fn patches(&self, i: usize, latent: &Rgb, tsf: &Tsf) -> Value {
+    fn local_psfs(&self, i: usize, latent: &Rgb, tsf: &Tsf) -> Value {
         let (seen, inside) = self.seen(latent, &tsf.base);
         let (blurred, weight) = self.luminance(i, &seen);
         let weight = weight.zip(&inside, |w, k| w * k);
@@ -772,7 +829,7 @@ impl Run<'_> {
         if *motion == DMat3::IDENTITY {
             return (latent.mean(), everywhere);
         }
-        let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse());
+        let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse(), 0);
         (seen.mean(), inside)
     }
 
@@ -832,6 +889,7 @@ impl Run<'_> {
             "noise": self.noise,
             "blind": blind,
             "frames": entries,
+            "degraded": self.degraded,
             "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,
             "timings_s": std::mem::take(&mut self.timings),
@@ -840,7 +898,9 @@ impl Run<'_> {
         for (&i, plane) in all.iter().zip(solution.misfit) {
             misfit[i] = Some(plane);
         }
-        Ok(Outcome { irradiance, reference, left_out: self.left_out, misfit, report })
+        let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
+        let Self { left_out, degraded, masks, .. } = self;
+        Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }
 }
 

@@ -42,13 +42,13 @@ pub struct Start {
     pub luminance: Plane,
 }
 
-/// Side in pixels down to which the coarsest level shrinks the frame's longer side: there a blur is a few pixels long. Coarser, bilinear
-/// warps are no longer true to a blur of less than a pixel, and the TSFs widen to make up for it.
+/// Side in pixels down to which the coarsest level shrinks the frame's longer side: there a blur is a few pixels long. Coarser, the blur of
+/// the shortest frame is less than a pixel and cannot be told.
 const COARSEST: usize = 250;
 /// Rounds of luminance and TSFs at the coarsest level and at finer ones.
-const ROUNDS: (usize, usize) = (10, 3);
-/// Rounds after which the better start is chosen.
-const TRIAL: usize = 2;
+const ROUNDS: (usize, usize) = (12, 5);
+/// Rounds after which the better start is chosen. After two, a start from a more blurred frame, which it explains by standing still, may lead.
+const TRIAL: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
 const LAMBDA: f32 = 3.0;
 /// Smoothness at the start of the coarsest level and of a finer one, in units of λ.
@@ -64,26 +64,33 @@ const FAINT: f64 = 0.02;
 /// One pixel of so many is held out.
 const HELD: usize = 29;
 
-/// `frame` at 1/`scale` of its size: means over squares, masked where any of their pixels is.
+/// `frame` at 1/`scale` (a power of two) of its size, masked where any pixel that is seen is.
 pub fn shrink(frame: &Frame, scale: usize) -> Frame {
     if scale == 1 {
         return frame.clone();
     }
-    let (w, h) = (frame.blurred.width / scale, frame.blurred.height / scale);
-    let n = (scale * scale) as f32;
-    let fold = |p: &Plane, x: usize, y: usize, start: f32, f: fn(f32, f32) -> f32| {
-        (0..scale * scale).fold(start, |s, k| f(s, p.at(x * scale + k % scale, y * scale + k / scale)))
+    // White noise falls by the sum of the filter's squared weights.
+    let kept = (20.0f32 / 64.0).powi(2);
+    let masked = frame.mask.map(|m| if m > 0.0 { 0.0 } else { 1.0 });
+    let lost = halve(&masked);
+    let (w, h) = lost.size();
+    let least = |x: usize, y: usize| (0..4).map(|k| frame.mask.at(2 * x + k % 2, 2 * y + k / 2)).fold(1.0, f32::min);
+    let half = Frame {
+        blurred: halve(&frame.blurred),
+        variance: halve(&frame.variance).map(|v| v * kept),
+        mask: Plane::from_fn(w, h, |x, y| if lost.at(x, y) > 0.0 { 0.0 } else { least(x, y) }),
+        clipped: (0..w * h).map(|p| (0..4).all(|k| frame.clipped[(p / w * 2 + k / 2) * frame.blurred.width + p % w * 2 + k % 2])).collect(),
     };
-    let add = |a: f32, b: f32| a + b;
-    let wide = frame.blurred.width;
-    Frame {
-        blurred: Plane::from_fn(w, h, |x, y| fold(&frame.blurred, x, y, 0.0, add) / n),
-        variance: Plane::from_fn(w, h, |x, y| fold(&frame.variance, x, y, 0.0, add) / (n * n)),
-        mask: Plane::from_fn(w, h, |x, y| fold(&frame.mask, x, y, 1.0, f32::min)),
-        clipped: (0..w * h)
-            .map(|p| (0..scale * scale).all(|k| frame.clipped[(p / w * scale + k / scale) * wide + p % w * scale + k % scale]))
-            .collect(),
-    }
+    shrink(&half, scale / 2)
+}
+
+/// Half the size through the binomial filter [1 3 3 1]/8: means over squares let through what the coarser grid cannot hold, and no warp is
+/// true to that.
+fn halve(p: &Plane) -> Plane {
+    let (w, h) = (p.width / 2, p.height / 2);
+    let f = [0.125f32, 0.375, 0.375, 0.125];
+    let rows = Plane::from_fn(w, p.height, |x, y| (0..4).map(|k| f[k] * p.clamped(2 * x as isize + k as isize - 1, y as isize)).sum());
+    Plane::from_fn(w, h, |x, y| (0..4).map(|k| f[k] * rows.clamped(x as isize, 2 * y as isize + k as isize - 1)).sum())
 }
 
 /// Bilinear sample.

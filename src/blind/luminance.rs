@@ -85,7 +85,8 @@ pub fn solve(frames: &[Frame], operators: &[Operator], latent: &Plane, held: &[b
             let back = operators[k].adjoint(&residual.iter().zip(&weight).map(|(r, w)| r * w).collect::<Vec<f32>>());
             right.iter_mut().zip(&back).for_each(|(a, b)| *a += b);
             let spread = operators[k].adjoint(&weight);
-            diagonal.iter_mut().zip(&spread).for_each(|(a, b)| *a += operators[k].energy() * b);
+            // Cubic weights have negative lobes; a preconditioner may not.
+            diagonal.iter_mut().zip(&spread).for_each(|(a, b)| *a += operators[k].energy() * b.max(0.0));
             weights.push(weight);
         }
         let edge: Vec<f32> = (0..n)

@@ -10,8 +10,10 @@
 mod joint;
 mod luminance;
 mod operator;
+mod patches;
 
 pub use joint::fix_warp;
 pub use joint::{Joint, Stage, Start, estimate};
 pub use luminance::{Frame, luminance_of};
 pub use operator::Operator;
+pub use patches::{Lack, PatchSetup, Patches, from_patches};

@@ -2,6 +2,9 @@
 //!
 //! The joint estimate applies K some thousand times to single planes that change their TSF after every few applications; there a
 //! few rows of multiply-adds are through before a GPU has compiled, uploaded and waited.
+//!
+//! Its warps are cubic, as the TSFs' fits are. Bilinear warps blur by themselves: the luminance then makes up for it by edges too steep, the
+//! fit of the TSFs against that luminance by wider ones, and the two drive each other on, round by round.
 
 use crate::image::Plane;
 use crate::pose::project;
@@ -27,7 +30,7 @@ struct Base {
 impl Operator {
     /// K of `tsf` for frames of `width` x `height` pixels and a latent grid that is larger by `pad` on every side.
     pub fn new(tsf: &Tsf, width: usize, height: usize, pad: usize) -> Self {
-        let set = TapSet::shifted(tsf, width, height, Interpolation::Bilinear);
+        let set = TapSet::shifted(tsf, width, height, Interpolation::Bicubic);
         let energy = set.energy() as f32;
         let bases = set
             .bases
@@ -55,52 +58,65 @@ impl Operator {
     /// K `latent`, on the frame's grid. What lies beyond the latent grid counts as 0.
     pub fn forward(&self, latent: &[f32]) -> Vec<f32> {
         let (w, h) = self.frame;
-        self.bases
-            .par_iter()
+        let lw = self.latent().0;
+        let warped: Vec<Vec<f32>> = self
+            .bases
+            .iter()
             .map(|base| {
-                let m = base.margin;
-                let wide = w + 2 * m;
-                let mut warped = vec![0.0f32; wide * (h + 2 * m)];
-                for (j, row) in warped.chunks_exact_mut(wide).enumerate() {
-                    self.walk(base, j, |i, at, f| {
-                        row[i] = f[0] * latent[at[0]] + f[1] * latent[at[1]] + f[2] * latent[at[2]] + f[3] * latent[at[3]];
+                let wide = w + 2 * base.margin;
+                let mut warped = vec![0.0f32; wide * (h + 2 * base.margin)];
+                warped.par_chunks_exact_mut(wide).enumerate().for_each(|(j, row)| {
+                    self.walk(base, j, |i, at, wx, wy| {
+                        let along = |k: usize| {
+                            let v = &latent[at + k * lw..][..4];
+                            wx[0] * v[0] + wx[1] * v[1] + wx[2] * v[2] + wx[3] * v[3]
+                        };
+                        row[i] = wy[0] * along(0) + wy[1] * along(1) + wy[2] * along(2) + wy[3] * along(3);
                     });
-                }
-                let mut out = vec![0.0f32; w * h];
-                for &(dx, dy, weight) in &base.taps {
-                    let (ox, oy) = ((m as i32 - dx) as usize, (m as i32 - dy) as usize);
-                    for (y, row) in out.chunks_exact_mut(w).enumerate() {
-                        let from = &warped[(y + oy) * wide + ox..][..w];
-                        row.iter_mut().zip(from).for_each(|(o, v)| *o += weight * v);
-                    }
-                }
-                out
+                });
+                warped
             })
-            .reduce(|| vec![0.0; w * h], add)
+            .collect();
+        let mut out = vec![0.0f32; w * h];
+        // Row by row: a row stays in the cache while all taps add to it.
+        out.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
+            for (base, warped) in self.bases.iter().zip(&warped) {
+                let m = base.margin as i32;
+                for &(dx, dy, weight) in &base.taps {
+                    let from = &warped[(y + (m - dy) as usize) * (w + 2 * base.margin) + (m - dx) as usize..][..w];
+                    row.iter_mut().zip(from).for_each(|(o, v)| *o += weight * v);
+                }
+            }
+        });
+        out
     }
 
     /// Kᵀ `frame`, on the latent grid.
     pub fn adjoint(&self, frame: &[f32]) -> Vec<f32> {
         let (w, h) = self.frame;
-        let n = self.latent().0 * self.latent().1;
+        let lw = self.latent().0;
+        let n = lw * self.latent().1;
         self.bases
             .par_iter()
             .map(|base| {
                 let m = base.margin;
                 let wide = w + 2 * m;
                 let mut warped = vec![0.0f32; wide * (h + 2 * m)];
-                for &(dx, dy, weight) in &base.taps {
-                    let (ox, oy) = ((m as i32 - dx) as usize, (m as i32 - dy) as usize);
-                    for (y, row) in frame.chunks_exact(w).enumerate() {
-                        let to = &mut warped[(y + oy) * wide + ox..][..w];
-                        to.iter_mut().zip(row).for_each(|(o, v)| *o += weight * v);
+                warped.par_chunks_exact_mut(wide).enumerate().for_each(|(j, to)| {
+                    for &(dx, dy, weight) in &base.taps {
+                        let (ox, y) = ((m as i32 - dx) as usize, j as i32 - (m as i32 - dy));
+                        if y >= 0 && y < h as i32 {
+                            let row = &frame[y as usize * w..][..w];
+                            to[ox..ox + w].iter_mut().zip(row).for_each(|(o, v)| *o += weight * v);
+                        }
                     }
-                }
+                });
                 let mut out = vec![0.0f32; n];
                 for (j, row) in warped.chunks_exact(wide).enumerate() {
-                    self.walk(base, j, |i, at, f| {
-                        for (a, share) in at.iter().zip(f) {
-                            out[*a] += share * row[i];
+                    self.walk(base, j, |i, at, wx, wy| {
+                        for (k, share) in wy.iter().enumerate() {
+                            let v = share * row[i];
+                            out[at + k * lw..][..4].iter_mut().zip(wx).for_each(|(o, x)| *o += x * v);
                         }
                     });
                 }
@@ -109,9 +125,10 @@ impl Operator {
             .reduce(|| vec![0.0; n], add)
     }
 
-    /// Calls `f(i, indices, weights)` for the pixels of row `j` of a base's array whose bilinear neighbours the latent grid holds.
+    /// Calls `f(i, index, weights along x, along y)` for the pixels of row `j` of a base's array whose 4 x 4 neighbours, the first of which is
+    /// at `index`, the latent grid holds.
     #[inline]
-    fn walk(&self, base: &Base, j: usize, mut f: impl FnMut(usize, [usize; 4], [f32; 4])) {
+    fn walk(&self, base: &Base, j: usize, mut f: impl FnMut(usize, usize, [f32; 4], [f32; 4])) {
         let (w, h) = self.frame;
         let (lw, lh) = self.latent();
         let centre = DVec2::new((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
@@ -122,31 +139,44 @@ impl Operator {
         for i in 0..w + 2 * base.margin {
             let p = if affine { first + i as f64 * step } else { project(&base.inverse, q(i)) + shift };
             let (x, y) = (p.x.floor(), p.y.floor());
-            let (fx, fy) = ((p.x - x) as f32, (p.y - y) as f32);
-            // On the last row or column the neighbour beyond has no weight.
-            if x < 0.0 || y < 0.0 || x >= lw as f64 || y >= lh as f64 {
+            if x < 1.0 || y < 1.0 || x + 2.0 >= lw as f64 || y + 2.0 >= lh as f64 {
                 continue;
             }
-            let (x, y) = (x as usize, y as usize);
-            if (x + 1 == lw && fx > 0.0) || (y + 1 == lh && fy > 0.0) {
-                continue;
-            }
-            let at = y * lw + x;
-            let (right, down) = (usize::from(x + 1 < lw), if y + 1 < lh { lw } else { 0 });
-            let (gx, gy) = (1.0 - fx, 1.0 - fy);
-            f(i, [at, at + right, at + down, at + down + right], [gx * gy, fx * gy, gx * fy, fx * fy]);
+            f(i, (y as usize - 1) * lw + x as usize - 1, cubic((p.x - x) as f32), cubic((p.y - y) as f32));
         }
     }
 
-    /// Pixels of the frame that see nothing beyond the latent grid.
+    /// Pixels of the frame that see nothing beyond the latent grid. The sum of the weights does not tell: cubic ones have both signs.
     pub fn inside(&self) -> Vec<bool> {
-        self.forward(&vec![1.0; self.latent().0 * self.latent().1]).iter().map(|v| (v - 1.0).abs() < 1e-3).collect()
+        let (w, h) = self.frame;
+        let mut inside = vec![true; w * h];
+        for base in &self.bases {
+            let (m, wide) = (base.margin as i32, w + 2 * base.margin);
+            let mut seen = vec![false; wide * (h + 2 * base.margin)];
+            for (j, row) in seen.chunks_exact_mut(wide).enumerate() {
+                self.walk(base, j, |i, _, _, _| row[i] = true);
+            }
+            inside.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
+                for &(dx, dy, _) in &base.taps {
+                    let from = &seen[(y + (m - dy) as usize) * wide + (m - dx) as usize..][..w];
+                    row.iter_mut().zip(from).for_each(|(o, v)| *o &= v);
+                }
+            });
+        }
+        inside
     }
 
     /// [`Operator::forward`] of a plane.
     pub fn blur(&self, latent: &Plane) -> Plane {
         Plane { width: self.frame.0, height: self.frame.1, data: self.forward(&latent.data) }
     }
+}
+
+/// Weights of cubic convolution (Keys 1981, a = -1/2) at fraction `t`.
+#[inline]
+fn cubic(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
 fn add(mut a: Vec<f32>, b: Vec<f32>) -> Vec<f32> {

@@ -115,14 +115,14 @@ pub(super) struct MergeArgs {
     /// How much a shaken frame loses weight where its blur does not explain it: 0 (trusted everywhere) and more [default: 1]
     #[arg(long, value_name = "C", allow_hyphen_values = true)]
     pub robust: Option<String>,
-    /// Full well and read noise in electrons, such as 12000,6 [default: estimated from the frames]
+    /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
     /// Interpolation of the warps
     #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
     pub interpolation: String,
-    /// When no frame is sharp: auto (all blurs and the scene together), joint (so even if a frame passes for sharp), off (merge only) [default: off]
-    #[arg(long, value_name = "auto|joint|off")]
+    /// When no frame is sharp: auto (all blurs and the scene together; also when no frame is surely sharp), joint (so even if a frame passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: off]
+    #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)
     #[arg(long, value_name = "FILE.json")]
@@ -175,13 +175,16 @@ pub(super) struct PhotoArgs {
     /// Tone mapping of --preview: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1 [default: filmic]
     #[arg(long, value_name = "OP[:NAME=V,...]", help_heading = "Result")]
     pub tonemap: Option<String>,
+    /// Give the JPEG of --preview a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long, help_heading = "Result")]
+    pub gain_map: bool,
     /// Write one page (HTML) that shows everything: before and after, frames, masks, blur, residuals, settings
     #[arg(long, value_name = "OUT.html", help_heading = "Result")]
     pub report_html: Option<PathBuf>,
     /// Options from a TOML file [default: unshaken/config.toml in the user's configuration folder, where it exists]
     #[arg(long, value_name = "FILE.toml", help_heading = "Settings")]
     pub config: Option<PathBuf>,
-    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: fast, archive
+    /// Options of one [preset.NAME] table of the configuration, or of a built-in one: archive, small
     #[arg(long, value_name = "NAME", help_heading = "Settings")]
     pub preset: Option<String>,
     /// Print the options that are in force, as a configuration file, and stop
@@ -200,6 +203,9 @@ pub(super) struct TonemapArgs {
     /// Operator: filmic, reinhard, reinhard-local, durand or fattal, with parameters such as filmic:exposure=1,saturation=0.9
     #[arg(long, value_name = "OP[:NAME=V,...]", default_value = "filmic")]
     pub tonemap: String,
+    /// Give the JPEG a gain map (Ultra HDR): brighter highlights where the screen can show them
+    #[arg(long)]
+    pub gain_map: bool,
     /// Quality of a JPEG, 1 to 100
     #[arg(long, value_name = "N", default_value_t = 92, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,

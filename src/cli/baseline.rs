@@ -61,6 +61,8 @@ pub(super) enum Method {
     Mertens,
     /// Each shaken frame deblurred by itself, then merged
     Naive,
+    /// All frames together, but with blur that is the same everywhere: stands in for Lu et al. 2009, whose program is not published
+    Uniform,
     /// All frames together: this program
     Unshaken,
     /// Weighted merge of frames from a tripod: the ideal
@@ -74,6 +76,7 @@ impl Method {
             Self::DebevecSharp => "debevec-sharp",
             Self::Mertens => "mertens",
             Self::Naive => "naive",
+            Self::Uniform => "uniform",
             Self::Unshaken => "unshaken",
             Self::Tripod => "tripod",
         }
@@ -118,7 +121,7 @@ pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
             None
         };
         let settings = Settings { sharp: sharp.clone(), ..Settings::default() };
-        let joint = if methods.iter().any(|m| matches!(m, Method::Naive | Method::Unshaken | Method::DebevecSharp)) {
+        let joint = if methods.iter().any(|m| matches!(m, Method::Naive | Method::Uniform | Method::Unshaken | Method::DebevecSharp)) {
             Some(Joint::new(&bracket, &response, &settings, tsf.as_ref(), events)?)
         } else {
             None
@@ -132,6 +135,7 @@ pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
             let image = match (m, &joint, &tripod) {
                 (Method::DebevecSharp, Some(j), _) => baseline::merge(&bracket, &response, &j.sharp),
                 (Method::Unshaken, Some(j), _) => j.irradiance.clone(),
+                (Method::Uniform, Some(j), _) => j.uniform(&bracket, &response, &settings, events)?.irradiance,
                 (Method::Naive, Some(j), _) => {
                     let mut hear = |f: f32| events(Event::Progress { stage: "deblurring each frame".into(), fraction: 0.5 + 0.4 * f });
                     baseline::deblur_each(&bracket, &response, &j.tsfs, &settings.deblur, &mut hear)?

@@ -33,16 +33,29 @@ enum Status {
     Interrupted,
 }
 
-/// What is kept of a finished bracket.
+/// What is kept of a bracket that was begun.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Record {
     format: String,
     version: u32,
-    /// Hash of the frames' contents, the options and the program's version.
+    /// Hash of the frames' contents, the options and the program's version; empty until it is finished.
     hash: String,
     status: Status,
     warnings: Vec<String>,
     seconds: f64,
+}
+
+impl Default for Record {
+    fn default() -> Self {
+        Self {
+            format: "unshaken-batch-record".into(),
+            version: 1,
+            hash: String::new(),
+            status: Status::Interrupted,
+            warnings: Vec::new(),
+            seconds: 0.0,
+        }
+    }
 }
 
 /// A bracket's line of the table.
@@ -215,14 +228,18 @@ impl Job<'_> {
             let note = if record.status == Status::Degraded { format!("degraded: {}", record.warnings.join("; ")) } else { String::new() };
             return Ok((Status::Skipped, note));
         }
+        // What an earlier batch wrote may be replaced; what somebody else put there may not, unless told.
+        if earlier.is_none() && !self.overwrite {
+            for path in [&image, &preview, &report] {
+                Output::check(path, false)?;
+            }
+        }
+        // From here on the results are the batch's own, even if it is killed before they are finished.
+        Output::check(&record_path, true)?.stage_json(&Record::default())?.commit()?;
         let mut command = Command::new(std::env::current_exe().context("the program does not find itself")?);
         command.args(["merge", "--json", "--config=none", "-o"]).arg(&image).arg("--preview").arg(&preview).arg("--report").arg(&report);
         command.args(self.options.iter().filter(|o| *o != "--overwrite")).args(&group.options);
-        // What an earlier batch wrote may be replaced; what somebody else put there may not, unless told.
-        if self.overwrite || earlier.is_some() {
-            command.arg("--overwrite");
-        }
-        command.arg("--").args(&group.frames).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.arg("--overwrite").arg("--").args(&group.frames).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let start = Instant::now();
         let mut child = command.spawn().context("cannot start another process")?;
         let said = listen(&mut child)?;
@@ -235,14 +252,7 @@ impl Job<'_> {
             Some(_) => return Ok((Status::Failed, said.error)),
             None => return Ok((Status::Failed, "its process was killed".into())),
         };
-        let record = Record {
-            format: "unshaken-batch-record".into(),
-            version: 1,
-            hash,
-            status,
-            warnings: said.warnings,
-            seconds: start.elapsed().as_secs_f64(),
-        };
+        let record = Record { hash, status, warnings: said.warnings, seconds: start.elapsed().as_secs_f64(), ..Record::default() };
         Output::check(&record_path, true)?.stage_json(&record)?.commit()?;
         Ok((status, if status == Status::Degraded { note } else { String::new() }))
     }

@@ -1,17 +1,17 @@
 //! `unshaken experiment`.
 
-use super::{Usage, with_progress};
+use super::{Usage, frames, with_progress};
 use crate::experiments::{Experiment, Lab, Report};
-use crate::io::output::{Output, Staged};
+use crate::io::output::{Output, Staged, ending};
 use crate::pipeline::Event;
 use anyhow::Context;
 use clap::Args;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 pub(super) struct ExperimentArgs {
-    /// fig3, tsf, fig5, fig7, fig11, fig12, sharpness, or all
+    /// fig3, fig4, tsf, fig5, fig6, ..., fig12, sharpness, office, or all
     #[arg(value_name = "NAME")]
     pub name: String,
     /// Folder for tables and pictures, made if need be
@@ -23,6 +23,9 @@ pub(super) struct ExperimentArgs {
     /// Seed of scenes, shake and noise
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,
+    /// Folder with a bracket of JPEG files with EXIF from a tripod, for the experiment 'office': it is calibrated, merged, shaken and photographed again
+    #[arg(long, value_name = "DIR")]
+    pub photographs: Option<PathBuf>,
     /// Replace outputs that exist
     #[arg(long)]
     pub overwrite: bool,
@@ -31,6 +34,17 @@ pub(super) struct ExperimentArgs {
 pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     let chosen =
         if args.name == "all" { Experiment::ALL.to_vec() } else { vec![Experiment::named(&args.name).map_err(|e| Usage(e.to_string()))?] };
+    let mut chosen = chosen;
+    if args.photographs.is_none() && chosen.contains(&Experiment::Office) {
+        if args.name != "all" {
+            return Err(
+                Usage("the experiment office needs photographs; give --photographs FOLDER with a bracket from a tripod".into()).into()
+            );
+        }
+        super::warn("office is left out: it needs --photographs FOLDER with a bracket from a tripod");
+        chosen.retain(|e| *e != Experiment::Office);
+    }
+    let photographs = args.photographs.as_deref().map(jpegs).transpose()?;
     std::fs::create_dir_all(&args.output_dir)
         .with_context(|| format!("{}: cannot be made; choose another --output-dir", args.output_dir.display()))?;
     let at = |name: String| Output::check(&args.output_dir.join(name), args.overwrite);
@@ -40,7 +54,8 @@ pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     }
     let begun = std::time::Instant::now();
     let texts = with_progress(|events| {
-        let mut lab = Lab::new(args.width as usize, args.seed);
+        let photographs = photographs.as_deref().map(|p| frames::read(p, None)).transpose()?;
+        let mut lab = Lab::new(args.width as usize, args.seed, photographs);
         let mut texts = Vec::new();
         for (i, &e) in chosen.iter().enumerate() {
             let mut hear = |event: Event| match event {
@@ -66,6 +81,20 @@ pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     println!("{}", texts.join("\n"));
     println!("wrote tables and pictures to {} in {:.0} s", args.output_dir.display(), begun.elapsed().as_secs_f64());
     Ok(())
+}
+
+/// The JPEG files of a folder, in the order of their names.
+fn jpegs(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder)
+        .with_context(|| format!("{}: cannot be read; give --photographs the folder of a bracket", folder.display()))?;
+    let mut found: Vec<PathBuf> =
+        entries.filter_map(|e| Some(e.ok()?.path())).filter(|p| matches!(ending(p).as_str(), "jpg" | "jpeg")).collect();
+    found.sort();
+    if found.len() < 2 {
+        let count = frames::count(found.len(), "JPEG file");
+        return Err(Usage(format!("--photographs: {} holds {count}; a bracket has two or more", folder.display())).into());
+    }
+    Ok(found)
 }
 
 /// Quality of the pictures as JPEG.

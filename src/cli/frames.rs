@@ -7,6 +7,7 @@ use crate::exposure::{Bracket, Frame};
 use crate::io::input::{self, Encoding, Input};
 use crate::io::metadata::{self, Metadata};
 use crate::io::output;
+use crate::noise::NoiseModel;
 use crate::response::Response;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -104,6 +105,8 @@ pub(super) struct Loaded {
     /// Of each frame, linear RGB to XYZ relative to D50.
     pub to_xyz: Vec<Matrix>,
     pub metadata: Vec<Metadata>,
+    /// The noise that all files note alike.
+    pub noise: Option<NoiseModel>,
     /// What the user should know.
     pub notes: Vec<String>,
 }
@@ -166,7 +169,19 @@ pub(super) fn load(paths: &[PathBuf], given: Option<Vec<f64>>, white: f32) -> cr
         to_xyz.push(input.to_xyz);
         metadata.push(input.metadata);
     }
-    Ok(Loaded { bracket: Bracket::new(frames)?, stated, to_xyz, metadata, notes })
+    let noise = noted_noise(&metadata);
+    if noise.is_none() && metadata.iter().any(|m| m.noise.is_some()) {
+        notes.push("the frames do not note one noise level (ISO speeds differ, or some note none); it is estimated from the frames".into());
+    }
+    Ok(Loaded { bracket: Bracket::new(frames)?, stated, to_xyz, metadata, noise, notes })
+}
+
+/// The noise level that all frames note, alike to a twentieth.
+fn noted_noise(metadata: &[Metadata]) -> Option<NoiseModel> {
+    let noted: Vec<[f64; 2]> = metadata.iter().map(|m| m.noise).collect::<Option<_>>()?;
+    let [shot, read] = *noted.first()?;
+    let alike = |a: f64, b: f64| (a - b).abs() <= 0.05 * b;
+    noted.iter().all(|n| alike(n[0], shot) && alike(n[1], read)).then_some(NoiseModel { shot, read })
 }
 
 fn pairs<'a>(paths: &[PathBuf], noted: &'a [Metadata]) -> Vec<(PathBuf, &'a Metadata)> {

@@ -135,10 +135,17 @@ pub(super) fn find(paths: &[PathBuf], gap: f64) -> Grouping {
     out
 }
 
-/// Two folders may hold a file of one name.
+/// Two folders may hold a file of one name: their names tell them apart, then numbers.
 fn distinct_names(groups: &mut [Group]) {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    groups.iter().for_each(|g| *counts.entry(g.name.clone()).or_default() += 1);
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
     for group in groups {
+        if counts[&group.name] > 1
+            && let Some(folder) = group.frames[0].parent().and_then(Path::file_name)
+        {
+            group.name = format!("{}-{}", folder.to_string_lossy(), group.name);
+        }
         let n = seen.entry(group.name.clone()).or_default();
         *n += 1;
         if *n > 1 {
@@ -190,26 +197,39 @@ struct Entry {
 
 /// The brackets of a manifest. Paths are relative to the current folder.
 pub(super) fn of_manifest(path: &Path) -> anyhow::Result<Grouping> {
-    let text = crate::io::read_text(path)?;
-    let shown = path.display();
-    let manifest: Manifest = toml::from_str(&text)
-        .map_err(|e| anyhow::anyhow!("{shown}: is not a manifest ({}); it holds [[bracket]] tables with name and frames", e.message()))?;
+    let groups = parse(&crate::io::read_text(path)?).with_context(|| path.display().to_string())?;
+    Ok(Grouping { groups, left_out: Vec::new() })
+}
+
+/// The brackets of a manifest's text.
+fn parse(text: &str) -> anyhow::Result<Vec<Group>> {
+    let manifest: Manifest = toml::from_str(text)
+        .map_err(|e| anyhow::anyhow!("is not a manifest ({}); it holds [[bracket]] tables with name and frames", e.message()))?;
     if manifest.bracket.is_empty() {
-        anyhow::bail!("{shown}: holds no [[bracket]]; 'unshaken batch --dry-run' prints a manifest");
+        anyhow::bail!("holds no [[bracket]]; 'unshaken batch --dry-run' prints a manifest");
     }
     let mut groups: Vec<Group> = Vec::new();
     for entry in manifest.bracket {
-        let plain = !entry.name.is_empty() && !entry.name.starts_with('.') && !entry.name.contains(['/', '\\']);
+        let plain =
+            !entry.name.is_empty() && !entry.name.starts_with('.') && !entry.name.contains(['/', '\\']) && !entry.name.contains('\0');
         if !plain {
-            anyhow::bail!("{shown}: {:?} cannot name a result; give a file name without folder and ending", entry.name);
+            anyhow::bail!("{:?} cannot name a result; give a file name without folder and ending", entry.name);
         }
         if groups.iter().any(|g| g.name == entry.name) {
-            anyhow::bail!("{shown}: two brackets are called {:?}; give them different names", entry.name);
+            anyhow::bail!("two brackets are called {:?}; give them different names", entry.name);
         }
-        let options = options::of_manifest(&entry.options).with_context(|| format!("{shown}: bracket {:?}", entry.name))?;
+        let options = options::of_manifest(&entry.options).with_context(|| format!("bracket {:?}", entry.name))?;
         groups.push(Group { name: entry.name, frames: entry.frames, options, note: "from the manifest".into() });
     }
-    Ok(Grouping { groups, left_out: Vec::new() })
+    Ok(groups)
+}
+
+/// Names of the brackets of a manifest's text (see `unshaken batch --manifest`).
+///
+/// # Errors
+/// Why it is no manifest, in words that follow the file's name.
+pub fn manifest_brackets(text: &str) -> Result<Vec<String>, String> {
+    parse(text).map(|groups| groups.into_iter().map(|g| g.name).collect()).map_err(|e| format!("{e:#}"))
 }
 
 /// The grouping as a manifest, with what was left out as comments.

@@ -28,20 +28,23 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     })?;
     let targets = targets.expect("set before the job is understood");
     let (text, quality) = with_progress(|events| {
-        let opened = job.open(events)?;
+        let mut opened = job.open(events)?;
         let settings = job.settings(&opened)?.reduced(job.divisor);
         let tsf = job.tsf.as_ref().map(|t| t.reduced(job.divisor));
-        let reduced = (job.divisor > 1).then(|| crate::response::reduced(&opened.bracket, &opened.response, job.divisor)).transpose()?;
-        let bracket = reduced.as_ref().unwrap_or(&*opened.bracket);
-        let mut degraded = Vec::new();
-        let outcome = pipeline::merge(bracket, &opened.response, &settings, tsf.as_ref(), &mut |event| {
+        if job.divisor > 1 {
+            // The frames themselves are not needed any more: their memory is.
+            opened.bracket = Arc::new(crate::response::reduced(&opened.bracket, &opened.response, job.divisor)?);
+        }
+        let mut warnings = Vec::new();
+        let outcome = pipeline::merge(&opened.bracket, &opened.response, &settings, tsf.as_ref(), &mut |event| {
             if let Event::Warning(text) = &event {
-                degraded.push(text.clone());
+                warnings.push(text.clone());
             }
             events(event)
         })?;
-        let text = job.write(&targets, &opened, bracket, &outcome, &degraded, events)?;
-        let quality = if degraded.is_empty() { Done::AsAsked } else { Done::Degraded };
+        let text = job.write(&targets, &opened, &opened.bracket, &outcome, &warnings, events)?;
+        let as_asked = opened.degraded.is_empty() && outcome.degraded.is_empty();
+        let quality = if as_asked { Done::AsAsked } else { Done::Degraded };
         Ok((text, quality))
     })?;
     done(&text, json!({ "output": args.output, "degraded": quality == Done::Degraded }));
@@ -66,6 +69,10 @@ pub(super) struct Opened {
     pub response: Response,
     /// What the report says of the response.
     origin: Value,
+    /// Why the response is less than was asked for.
+    degraded: Vec<String>,
+    /// Noise that the files note.
+    noise: Option<NoiseModel>,
     /// Of each frame, linear RGB to XYZ relative to D50.
     pub to_xyz: Vec<Matrix>,
     metadata: Vec<Metadata>,
@@ -106,7 +113,7 @@ impl<'a> Job<'a> {
                 noted.exposure_time = Some(frame.exposure_time);
             }
         }
-        let frames::Loaded { bracket, stated, to_xyz, metadata, notes } = loaded;
+        let frames::Loaded { bracket, stated, to_xyz, metadata, noise, notes } = loaded;
         if let (Some(file), Some(path)) = (&self.tsf, &args.tsf) {
             check_tsfs(file, path, &bracket)?;
         }
@@ -131,7 +138,8 @@ impl<'a> Job<'a> {
         let stated = stated.filter(|_| linear || !jpeg && args.response.as_deref() != Some("auto"));
         let (stated_by, stated) = stated.map_or((None, None), |(what, response)| (Some(what), Some(response)));
         let by_file = self.response.is_none().then_some(stated_by).flatten();
-        let (response, mut origin) = super::response::choose(args, self.response.clone().or(stated), &bracket, events)?;
+        let chosen = super::response::choose(args, self.response.clone().or(stated), &bracket, events)?;
+        let (response, mut origin, degraded) = (chosen.response, chosen.report, chosen.degraded);
         if let Some(what) = by_file {
             origin["origin"] = json!(format!("stated by the files: {what}"));
         }
@@ -139,7 +147,7 @@ impl<'a> Job<'a> {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
-        Ok(Opened { bracket: Arc::new(bracket), response, origin, to_xyz, metadata, notes })
+        Ok(Opened { bracket: Arc::new(bracket), response, origin, degraded, noise, to_xyz, metadata, notes })
     }
 
     /// The settings for frames of full size.
@@ -149,6 +157,7 @@ impl<'a> Job<'a> {
             let (w, h) = opened.bracket.size();
             settings.focal_px = frames::focal_px(&self.args.frames[0], w, h)?;
         }
+        settings.noise = settings.noise.or(opened.noise);
         Ok(settings)
     }
 
@@ -159,7 +168,7 @@ impl<'a> Job<'a> {
         opened: &Opened,
         bracket: &Bracket,
         outcome: &Outcome,
-        degraded: &[String],
+        warnings: &[String],
         events: &mut dyn FnMut(Event) -> bool,
     ) -> anyhow::Result<String> {
         let (args, photo) = (self.args, &self.photo);
@@ -189,11 +198,20 @@ impl<'a> Job<'a> {
         }
         let mut outcome = std::borrow::Cow::Borrowed(outcome);
         if targets.page.is_some() || targets.report.is_some() {
+            let noise_origin = match (self.settings.noise, opened.noise) {
+                (Some(_), _) => "given",
+                (None, Some(_)) => "noted by the files",
+                (None, None) => "estimated from the frames",
+            };
+            let degraded: Vec<&String> = opened.degraded.iter().chain(&outcome.degraded).collect();
+            let degraded = json!(degraded);
             let outcome = outcome.to_mut();
             if let Some(report) = outcome.report.as_object_mut() {
                 report.insert("response".into(), opened.origin.clone());
+                report.insert("noise_origin".into(), json!(noise_origin));
                 report.insert("exposure_notes".into(), json!(opened.notes));
-                report.insert("warnings".into(), json!(degraded));
+                report.insert("warnings".into(), json!(warnings));
+                report.insert("degraded".into(), degraded);
                 report.insert(
                     "colour".into(),
                     json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),
@@ -214,7 +232,12 @@ impl<'a> Job<'a> {
         if targets.preview.is_some() || targets.page.is_some() {
             let display = in_primaries(Primaries::Rec709).0;
             if let Some(target) = &targets.preview {
-                staged.push(target.stage_picture(&photo.operator.apply(&display), JPEG_QUALITY, noted)?);
+                let picture = photo.operator.apply(&display);
+                staged.push(if args.photo.gain_map {
+                    target.stage_gain_map(&picture, &display, JPEG_QUALITY, noted)?
+                } else {
+                    target.stage_picture(&picture, JPEG_QUALITY, noted)?
+                });
             }
             if let Some(target) = &targets.page {
                 let page = page::Page {
@@ -223,7 +246,8 @@ impl<'a> Job<'a> {
                     outcome: &outcome,
                     display: &display,
                     to_display: colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries"), own),
-                    warnings: degraded,
+                    warnings,
+                    divisor: self.divisor,
                     settings: photo.listing(args),
                 };
                 staged.push(target.stage_text(&page.html())?);
@@ -272,23 +296,17 @@ impl PhotoSettings {
             None => Operator::default(),
             Some(words) => Operator::parse(words).map_err(|e| Usage(format!("--tonemap: {e}")))?,
         };
-        let ending = output::ending(&args.output);
         let refuse = |option: &str, why: &str| Err(Usage(format!("{option}: {why}")));
-        match ending.as_str() {
-            "exr" | "tif" | "tiff" => {}
-            "hdr" if photo.half => return refuse("--half", "Radiance HDR has one depth; leave --half out"),
-            "hdr" if primaries != Primaries::Rec709 => return refuse("--primaries", "Radiance HDR is Rec. 709; write OpenEXR or TIFF"),
-            "hdr" => {}
-            _ => return refuse("--output", "the name ends with neither .exr, .hdr, .tif nor .tiff; name the format by the ending"),
-        }
-        if photo.layers && ending != "exr" {
-            return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
-        }
         if photo.tonemap.is_some() && args.preview.is_none() {
             return refuse("--tonemap", "is for the picture of --preview; name one");
         }
-        if let Some(path) = &args.preview {
-            check_picture_name("--preview", path)?;
+        match &args.preview {
+            Some(path) => {
+                check_picture_name("--preview", path)?;
+                check_gain_map(photo.gain_map, "--preview", path)?;
+            }
+            None if photo.gain_map => return refuse("--gain-map", "is for the picture of --preview; name one"),
+            None => {}
         }
         Ok(Self { white, primaries, operator })
     }
@@ -314,7 +332,7 @@ impl PhotoSettings {
             ("--layers".into(), set(args.photo.layers)),
             ("--tonemap".into(), self.operator.to_string()),
             ("--no-align".into(), set(args.no_align)),
-            ("--noise".into(), or(&args.noise, "estimated")),
+            ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
             ("--lambda".into(), or(&args.lambda, "2.5")),
             ("--robust".into(), or(&args.robust, "1")),
@@ -328,6 +346,14 @@ pub(super) fn check_picture_name(option: &str, path: &Path) -> Result<(), Usage>
         "png" | "jpg" | "jpeg" => Ok(()),
         _ => Err(Usage(format!("{option}: {} ends with neither .png nor .jpg; name the format by the ending", path.display()))),
     }
+}
+
+/// Gain maps are for JPEG.
+pub(super) fn check_gain_map(asked: bool, option: &str, path: &Path) -> Result<(), Usage> {
+    if asked && !["jpg", "jpeg"].contains(&output::ending(path).as_str()) {
+        return Err(Usage(format!("--gain-map: only JPEG holds a gain map; name the picture of {option} .jpg")));
+    }
+    Ok(())
 }
 
 fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
@@ -403,11 +429,12 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         None => Blind::default(),
         Some("auto") => Blind::Auto,
         Some("joint") => Blind::Joint,
+        Some("patches") => Blind::Patches,
         Some("off") => Blind::Off,
-        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint nor off"))),
+        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint, patches nor off"))),
     };
-    if settings.blind == Blind::Joint && args.tsf.is_some() {
-        return Err(Usage("--blind joint estimates the TSFs that --tsf gives; leave one of them out".into()));
+    if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {
+        return Err(Usage(format!("--blind {word} estimates the TSFs that --tsf gives; leave one of them out")));
     }
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {
@@ -491,6 +518,25 @@ pub(super) struct Targets {
     page: Option<Output>,
 }
 
+/// Refuses what the format of the output, by its ending, cannot hold.
+fn check_format(args: &MergeArgs) -> Result<(), Usage> {
+    let photo = &args.photo;
+    let rec709 = photo.primaries.as_deref().is_none_or(|word| Primaries::named(word) == Some(Primaries::Rec709));
+    let ending = output::ending(&args.output);
+    let refuse = |option: &str, why: &str| Err(Usage(format!("{option}: {why}")));
+    match ending.as_str() {
+        "exr" | "tif" | "tiff" => {}
+        "hdr" if photo.half => return refuse("--half", "Radiance HDR has one depth; leave --half out"),
+        "hdr" if !rec709 => return refuse("--primaries", "Radiance HDR is Rec. 709; write OpenEXR or TIFF"),
+        "hdr" => {}
+        _ => return refuse("--output", "the name ends with neither .exr, .hdr, .tif nor .tiff; name the format by the ending"),
+    }
+    if photo.layers && ending != "exr" {
+        return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
+    }
+    Ok(())
+}
+
 pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
     let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
     inputs.extend(response_file.map(|p| ("response file", p)));
@@ -503,12 +549,15 @@ pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow:
     output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
     let check = |p: &PathBuf| Output::check(p, args.overwrite);
     let checked = |p: &Option<PathBuf>| p.as_ref().map(check).transpose();
-    Ok(Targets {
+    let targets = Targets {
         linear: check(&args.output)?,
         preview: checked(&args.preview)?,
         report: checked(&args.report)?,
         page: checked(&args.photo.report_html)?,
-    })
+    };
+    // A folder or an input first: its name says nothing of a format.
+    check_format(args)?;
+    Ok(targets)
 }
 
 pub(super) fn read_response(path: &Path) -> Result<Response, Error> {

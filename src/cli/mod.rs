@@ -25,6 +25,9 @@ mod response;
 mod synth;
 mod tonemap;
 
+pub use grouping::manifest_brackets;
+pub use options::configured_options;
+
 use crate::error::Error;
 use crate::pipeline::Event;
 use progress::Voice;

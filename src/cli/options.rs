@@ -168,13 +168,30 @@ pub(super) fn argument(arg: &Arg, value: &Value) -> anyhow::Result<Vec<OsString>
         Value::Float(x) => Ok(x.to_string()),
         other => Err(anyhow::anyhow!("{other} is no value of an option; give a number or a text")),
     };
+    let option = |text: String| OsString::from(format!("--{long}={text}"));
     Ok(match value {
         Value::Boolean(true) if flag => vec![format!("--{long}").into()],
         Value::Boolean(false) if flag => vec![],
         _ if flag => anyhow::bail!("{value} is neither true nor false"),
-        Value::Array(list) => vec![format!("--{long}={}", list.iter().map(word).collect::<anyhow::Result<Vec<_>>>()?.join(",")).into()],
-        other => vec![format!("--{long}={}", word(other)?).into()],
+        // An option that may be given several times, or one whose value is a list.
+        Value::Array(list) if repeats(arg) => list.iter().map(|v| word(v).map(option)).collect::<anyhow::Result<_>>()?,
+        Value::Array(list) => vec![option(list.iter().map(word).collect::<anyhow::Result<Vec<_>>>()?.join(","))],
+        other => vec![option(word(other)?)],
     })
+}
+
+fn repeats(arg: &Arg) -> bool {
+    matches!(arg.get_action(), ArgAction::Append)
+}
+
+/// The options, as on a command line, that a configuration's text stands for, presets left aside.
+///
+/// # Errors
+/// Why it is no configuration, in words that follow the file's name.
+pub fn configured_options(text: &str) -> Result<Vec<String>, String> {
+    let table = text.parse::<Table>().map_err(|e| format!("is not a configuration in TOML ({})", e.message()))?;
+    let options = of_manifest(&table).map_err(|e| format!("{e:#}"))?;
+    Ok(options.into_iter().map(|o| o.to_string_lossy().into_owned()).collect())
 }
 
 /// Options for one bracket's merge from the keys of a manifest.
@@ -225,8 +242,13 @@ fn in_force(command: &Command, sub: &ArgMatches) -> String {
             text += &format!("# {help}\n{long} = {}\n", sub.get_flag(id));
         } else if set {
             let values: Vec<&OsStr> = sub.get_raw(id).into_iter().flatten().collect();
-            let joined = values.iter().map(|v| v.to_string_lossy()).collect::<Vec<_>>().join(",");
-            text += &format!("# {help}\n{long} = {}\n", Value::String(joined));
+            let words = values.iter().map(|v| v.to_string_lossy().into_owned());
+            let value = if repeats(arg) {
+                Value::Array(words.map(Value::String).collect())
+            } else {
+                Value::String(words.collect::<Vec<_>>().join(","))
+            };
+            text += &format!("# {help}\n{long} = {value}\n");
         } else {
             text += &format!("# {help}\n# {long} = \"...\"\n");
         }

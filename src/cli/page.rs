@@ -2,10 +2,10 @@
 
 use crate::baseline;
 use crate::colour::{self, Matrix};
-use crate::exposure::Bracket;
+use crate::exposure::{Bracket, Frame};
 use crate::image::{Plane, Rgb};
 use crate::layers;
-use crate::mask;
+use crate::merge::resampled;
 use crate::pipeline::Outcome;
 use crate::response::Response;
 use crate::tonemap::ToneMap;
@@ -25,6 +25,8 @@ pub(super) struct Page<'a> {
     /// From the frames' linear RGB to Rec. 709.
     pub to_display: Matrix,
     pub warnings: &'a [String],
+    /// Frames were reduced to one over this.
+    pub divisor: usize,
     pub settings: Vec<(String, String)>,
 }
 
@@ -44,9 +46,14 @@ impl Page<'_> {
         let _ = writeln!(
             out,
             "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{t} - unshaken</title><style>{STYLE}</style></head><body>\n\
-             <h1>{t}</h1>\n<p>{} x {} pixels from {} frames; reference frame {}. {}</p>",
+             <h1>{t}</h1>\n<p>{} x {} pixels{} from {} frames; reference frame {}. {}</p>",
             size.0,
             size.1,
+            if self.divisor > 1 {
+                format!(" (the frames reduced to 1/{}; places and lengths are in its pixels)", self.divisor)
+            } else {
+                String::new()
+            },
             self.bracket.frames().len(),
             escaped(&self.bracket.frames()[self.outcome.reference].name),
             escaped(concat!("unshaken ", env!("CARGO_PKG_VERSION"))),
@@ -72,14 +79,14 @@ impl Page<'_> {
     fn slider(&self, out: &mut String) {
         let all: Vec<usize> = (0..self.bracket.frames().len()).filter(|&i| self.outcome.misfit[i].is_some()).collect();
         let scale = self.bracket.frames()[self.outcome.reference].exposure_time as f32;
-        let mut before = baseline::merge(self.bracket, self.response, &all).map_planes(|p| p.map(|v| v * scale));
+        let mut before = baseline::merge(&self.registered(), self.response, &all).map_planes(|p| p.map(|v| v * scale));
         colour::convert(&mut before, &self.to_display);
         let map = ToneMap::fit(self.display);
         let picture = |image: &Rgb| data_url(&shrunk(&map.apply(image), LARGE), 88);
         let _ = writeln!(
             out,
             "<h2>Before and after</h2>\n<div class=\"slider\" id=\"slider\" style=\"aspect-ratio:{w}/{h}\">\
-             <img alt=\"plain merge of the frames\" src=\"{}\"><div class=\"after\" id=\"after\"><img alt=\"unshaken\" src=\"{}\"></div>\
+             <img alt=\"plain merge of the registered frames\" src=\"{}\"><div class=\"after\" id=\"after\"><img alt=\"unshaken\" src=\"{}\"></div>\
              <span class=\"tag left\">plain merge</span><span class=\"tag right\">unshaken</span>\
              <input id=\"handle\" aria-label=\"before and after\" type=\"range\" min=\"0\" max=\"1000\" value=\"500\"></div>",
             picture(&before),
@@ -89,14 +96,23 @@ impl Page<'_> {
         );
     }
 
+    /// The frames where registration places them, as a plain merge would have them.
+    fn registered(&self) -> Bracket {
+        let frames = self.bracket.frames().iter().zip(&self.outcome.places).map(|(f, place)| {
+            if *place == glam::DMat3::IDENTITY {
+                return f.clone();
+            }
+            let everywhere = f.intensity.0[0].map(|_| 1.0);
+            Frame { intensity: resampled(&f.intensity, &everywhere, place, 0).0, ..f.clone() }
+        });
+        // Sizes and exposure times are those of a bracket.
+        Bracket::new(frames.collect()).unwrap_or_else(|_| self.bracket.clone())
+    }
+
     /// Each frame: picture, mask, residual, registration, blur.
     fn frames(&self, out: &mut String) {
-        out.push_str("<h2>Frames</h2>\n");
+        out.push_str("<h2>Frames</h2>\n<p>Each picture lies on its frame's own pixels; the result lies on the reference frame's.</p>\n");
         let report = self.outcome.report["frames"].as_array().cloned().unwrap_or_default();
-        let sharp: Vec<bool> = report.iter().map(|f| f["sharp"] == true).collect();
-        // Each on its own pixels: where a mask looks at another frame, this is off by what registration found.
-        let still = vec![glam::DMat3::IDENTITY; sharp.len()];
-        let masks = (sharp.len() == self.bracket.frames().len()).then(|| mask::masks(self.bracket.frames(), &sharp, ALPHA, &still));
         for (i, frame) in self.bracket.frames().iter().enumerate() {
             let entry = report.get(i).unwrap_or(&Value::Null);
             let used = self.outcome.misfit[i].is_some();
@@ -116,8 +132,8 @@ impl Page<'_> {
                 escaped(reason)
             );
             figure(out, "intensity", &data_url(&shrunk(&codes(&frame.intensity), SMALL), 85));
-            if let Some(masks) = &masks {
-                figure(out, "mask: white counts", &data_url(&shrunk(&grey(&masks[i], |v| v), SMALL), 85));
+            if used {
+                figure(out, "mask: white counts", &data_url(&shrunk(&grey(&self.outcome.masks[i], |v| v), SMALL), 85));
             }
             if let Some(misfit) = &self.outcome.misfit[i] {
                 // From black at 0 over grey at what noise explains to white at sixteen times that.
@@ -184,9 +200,6 @@ impl Page<'_> {
         plot(out, "outer iteration", "log10 objective", &[points], true);
     }
 }
-
-/// Default α of the masks.
-const ALPHA: f32 = 0.3;
 
 fn figure(out: &mut String, caption: &str, url: &str) {
     let _ = write!(out, "<figure><img alt=\"{c}\" src=\"{url}\"><figcaption>{c}</figcaption></figure>", c = escaped(caption));

@@ -7,14 +7,22 @@ use crate::pipeline::Event;
 use crate::response::{self, ExposureCheck, Response};
 use serde_json::{Value, json};
 
-/// The response and what the report says of it. `given`: from the command line. Otherwise, and with `--response auto`, it is estimated from JPEG frames;
+/// A response, what the report says of it, and why a result that rests on it is less than it should be.
+pub(super) struct Chosen {
+    pub response: Response,
+    pub report: Value,
+    pub degraded: Vec<String>,
+}
+
+/// The response of a merge. `given`: from the command line. Otherwise, and with `--response auto`, it is estimated from JPEG frames;
 /// PNG and TIFF frames without a word on it are taken as sRGB, which is what programs write into them.
 pub(super) fn choose(
     args: &MergeArgs,
     given: Option<Response>,
     bracket: &Bracket,
     events: &mut dyn FnMut(Event) -> bool,
-) -> Result<(Response, Value)> {
+) -> Result<Chosen> {
+    let mut degraded = Vec::new();
     let asked = args.response.as_deref() == Some("auto");
     let jpeg = args.frames.iter().all(|p| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg")));
     if given.is_none() && (asked || jpeg) {
@@ -24,13 +32,15 @@ pub(super) fn choose(
                 if let Some(text) = &found.poor {
                     events(Event::Warning(format!("{text}; 'unshaken calibrate' measures it")));
                 }
-                tell(&found.exposures, bracket, events);
-                let origin = report(&found.response, &format!("estimated from the frames: {}", found.method), &found.exposures);
-                return Ok((found.response, origin));
+                degraded.extend(tell(&found.exposures, bracket, events));
+                let report = report(&found.response, &format!("estimated from the frames: {}", found.method), &found.exposures);
+                return Ok(Chosen { response: found.response, report, degraded });
             }
             Err(e) if asked => return Err(e),
             Err(Error::Bracket(text)) => {
-                events(Event::Warning(format!("{text}; the frames are taken as sRGB")));
+                let text = format!("{text}; the frames are taken as sRGB");
+                degraded.push(text.clone());
+                events(Event::Warning(text));
             }
             Err(e) => return Err(e),
         }
@@ -42,15 +52,16 @@ pub(super) fn choose(
     let origin = if given.is_some() { "given" } else { "assumed" };
     let used = given.unwrap_or(Response::Srgb);
     let check = response::check_exposures(bracket, &used);
-    tell(&check, bracket, events);
-    let origin = report(&used, origin, &check);
-    Ok((used, origin))
+    degraded.extend(tell(&check, bracket, events));
+    let report = report(&used, origin, &check);
+    Ok(Chosen { response: used, report, degraded })
 }
 
-fn tell(check: &ExposureCheck, bracket: &Bracket, events: &mut dyn FnMut(Event) -> bool) {
-    if let Some(text) = check.warning(bracket) {
-        events(Event::Warning(text));
-    }
+/// Warns of exposure times that the pixels contradict.
+fn tell(check: &ExposureCheck, bracket: &Bracket, events: &mut dyn FnMut(Event) -> bool) -> Option<String> {
+    let text = check.warning(bracket)?;
+    events(Event::Warning(text.clone()));
+    Some(text)
 }
 
 fn report(response: &Response, origin: &str, check: &ExposureCheck) -> Value {

@@ -200,7 +200,7 @@ pub(super) fn run(args: &SynthArgs) -> anyhow::Result<()> {
         }
         Ok(summary(args, &numbers, &targets, (width, height), &made.truth, seconds))
     })?;
-    println!("{text}");
+    super::progress::done(&text, serde_json::json!({ "output": args.output_dir }));
     Ok(())
 }
 

@@ -182,6 +182,9 @@ pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usiz
     if worst < 1e-6 { 0 } else { (worst.ceil() as usize + 3).min(limit) }
 }
 
+/// Part of the strength of the residual-driven weights that a displaced sharp frame gets: what its samples between the grid's pixels differ
+/// by is no wrong TSF, and it is the best frame there is on its own pixels.
+const STILL_ROBUST: f32 = 0.3;
 /// Displacement in pixels from which a frame counts as displaced rather than shaken.
 const DISPLACED: f64 = 4.0;
 
@@ -502,6 +505,7 @@ impl<'a> Solver<'a> {
                         stride: self.frame.0,
                         accumulate: false,
                     };
+                    let robust = if moving.still { STILL_ROBUST * robust } else { robust };
                     steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, robust, &to));
                 }
             }

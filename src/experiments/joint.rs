@@ -4,8 +4,9 @@ use crate::error::Result;
 use crate::exposure::Bracket;
 use crate::image::Rgb;
 use crate::pipeline::{self, Event, Settings};
+use crate::pose::Pose;
 use crate::response::Response;
-use crate::tsf::{Tsf, TsfEntry, TsfFile};
+use crate::tsf::{Model, Tsf, TsfEntry, TsfFile};
 use serde_json::Value;
 
 /// What the program itself finds: irradiance per second, TSFs, the sharp frames.
@@ -46,5 +47,35 @@ impl Joint {
         let all: Vec<usize> = (0..entries.len()).collect();
         let sharp = if sharp.is_empty() { bracket.shortest(&all).into_iter().collect() } else { sharp };
         Ok(Self { irradiance: outcome.irradiance.map_planes(|p| p.map(|v| v / seconds)), tsfs, sharp, report: outcome.report })
+    }
+
+    /// The same bracket with blur that is the same everywhere, as P.-Y. Lu et al. ("High dynamic range image reconstruction from
+    /// hand-held cameras", 2009) have it, whose program is not published: the program restricted to translations. Where no frame is sharp, the translations of the TSFs
+    /// that were found with roll, which favours it.
+    ///
+    /// # Errors
+    /// Those of the pipeline.
+    pub fn uniform(
+        &self,
+        bracket: &Bracket,
+        response: &Response,
+        settings: &Settings,
+        events: &mut dyn FnMut(Event) -> bool,
+    ) -> Result<Self> {
+        let settings = Settings { model: Model::Translation, ..settings.clone() };
+        if self.tsfs.iter().any(|t| t.single().is_some()) {
+            return Self::new(bracket, response, &settings, None, events);
+        }
+        let (w, h) = bracket.size();
+        let entry = |(tsf, frame): (&Tsf, &crate::exposure::Frame)| {
+            let shift = |p: &Pose| {
+                let middle = p.apply(tsf.focal_px, glam::DVec2::ZERO);
+                Pose::planar(middle.x, middle.y, 0.0, p.weight)
+            };
+            let poses = tsf.poses.iter().map(shift).collect();
+            TsfEntry::new(&frame.name, w, h, &Tsf { poses, ..tsf.clone() })
+        };
+        let file = TsfFile::new(self.tsfs.iter().zip(bracket.frames()).map(entry).collect());
+        Self::new(bracket, response, &settings, Some(&file), events)
     }
 }

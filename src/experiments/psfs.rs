@@ -1,112 +1,165 @@
-//! Figure 3: patches of a shaken frame, the true PSF of each and the estimated one.
+//! Figures 3 and 4: patches of shaken frames, the true PSF of each and the estimated one.
 
-use super::study::{SHAKEN, Shaking, TIMES};
-use super::{Lab, Report, sheet};
+use super::local::{self, RADIUS, centre, error, median, smoothed, true_psf};
+use super::study::{Events, Exposures, Shaking, seconds};
+use super::{Joint, Lab, Report, sheet};
 use crate::error::Result;
+use crate::exposure::Bracket;
 use crate::image::Plane;
-use crate::pipeline::Event;
-use crate::pose::project;
+use crate::pipeline::{Blind, Settings};
+use crate::psf::{Patch, Psf};
 use crate::synth::Drawn;
-use crate::tsf::Tsf;
 use glam::DVec2;
 use image::{RgbImage, imageops};
 
 /// Patches that the picture shows.
 const SHOWN: usize = 5;
 
-/// True PSF at `p` (centred pixels) by eq. (5): each pose's weight at p - Γ⁻¹ p, split bilinearly.
-pub(super) fn true_psf(tsf: &Tsf, p: DVec2, radius: usize) -> Plane {
-    let side = 2 * radius + 1;
-    let mut psf = Plane::filled(side, side, 0.0);
-    for pose in &tsf.poses {
-        let u = p - project(&pose.homography(tsf.focal_px).inverse(), p);
-        let (fx, fy) = (u.x.floor(), u.y.floor());
-        for (j, wy) in [(0.0, 1.0 - (u.y - fy)), (1.0, u.y - fy)] {
-            for (i, wx) in [(0.0, 1.0 - (u.x - fx)), (1.0, u.x - fx)] {
-                let (x, y) = (fx + i + radius as f64, fy + j + radius as f64);
-                if x >= 0.0 && y >= 0.0 && x < side as f64 && y < side as f64 {
-                    psf.data[y as usize * side + x as usize] += (pose.weight * wx * wy) as f32;
-                }
-            }
-        }
-    }
-    psf
-}
-
-/// Mean over 3 x 3 pixels, weights 1 2 1: what a pixel's worth of displacement cannot change much.
-fn smoothed(p: &Plane) -> Plane {
-    let inside = |x: isize, y: isize| {
-        if x < 0 || y < 0 || x >= p.width as isize || y >= p.height as isize { 0.0 } else { p.at(x as usize, y as usize) }
-    };
-    Plane::from_fn(p.width, p.height, |x, y| {
-        let tap = |i: isize, j: isize| ((2 - i.abs()) * (2 - j.abs())) as f32 / 16.0 * inside(x as isize + i, y as isize + j);
-        (-1..=1).flat_map(|j| (-1..=1).map(move |i| (i, j))).map(|(i, j)| tap(i, j)).sum()
-    })
-}
-
-/// Norm of the difference over the norm of the truth.
-fn error(a: &Plane, truth: &Plane) -> f64 {
-    let norm = |v: &mut dyn Iterator<Item = f32>| v.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-    norm(&mut a.data.iter().zip(&truth.data).map(|(a, b)| a - b)) / norm(&mut truth.data.iter().copied()).max(1e-12)
-}
-
-pub(super) fn run(lab: &mut Lab, events: &mut dyn FnMut(Event) -> bool) -> Result<Report> {
-    let study = lab.study(Drawn::Chart, Shaking::Grid, events)?;
-    let (w, h) = study.made.bracket.size();
-    let centre = DVec2::new((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
-    let mut table = String::from("| frame | patch at | true width (px) | error | error, 1 px smoothed |\n|---|---|---|---|---|\n");
+pub(super) fn run(lab: &mut Lab, events: Events) -> Result<Report> {
+    let study = lab.study((Drawn::Chart, Exposures::Sharp3, Shaking::Grid), events)?;
+    let size = study.made.bracket.size();
+    let mut table = String::from(
+        "| frame | patch at | true width (px) | error of eq. (11) | 1 px smoothed | error of the TSF's | 1 px smoothed |\n|---|---|---|---|---|---|---|\n",
+    );
     let (mut rows, mut errors) = (Vec::new(), Vec::new());
-    for (i, time) in TIMES.into_iter().enumerate().skip(SHAKEN) {
-        let mut marked = study.photo(i);
+    for (i, time) in study.times().into_iter().enumerate().skip(study.shaken()) {
         let photo = study.photo(i);
-        let mut strips: [Vec<(String, RgbImage)>; 3] = Default::default();
-        let patches = study.joint.report["frames"][i]["blur"]["patches"].as_array().cloned().unwrap_or_default();
-        for (k, patch) in patches.iter().enumerate() {
-            let number = |v: &serde_json::Value| v.as_u64().unwrap_or(0) as usize;
-            let (x, y, size, radius) = (number(&patch["x"]), number(&patch["y"]), number(&patch["size"]), number(&patch["psf"]["radius"]));
-            let values: Vec<f32> =
-                patch["psf"]["values"].as_array().into_iter().flatten().map(|v| v.as_f64().unwrap_or(0.0) as f32).collect();
-            let Ok(estimated) = Plane::from_vec(2 * radius + 1, 2 * radius + 1, values) else { continue };
-            let half = (size as f64 - 1.0) / 2.0;
-            let truth = true_psf(&study.made.tsfs[i], DVec2::new(x as f64 + half, y as f64 + half) - centre, radius);
-            let (raw, smooth) = (error(&estimated, &truth), error(&smoothed(&estimated), &smoothed(&truth)));
-            let wide = crate::psf::Psf { radius, values: truth.clone() }.extent();
-            table += &format!("| {} s | ({x}, {y}), {size} px | {wide:.1} | {raw:.2} | {smooth:.2} |\n", time);
-            errors.push((raw, smooth));
-            frame(&mut marked, x as u32, y as u32, size as u32);
+        let mut marked = photo.clone();
+        let mut strips: [Vec<(String, RgbImage)>; 4] = Default::default();
+        for (k, (patch, psf)) in local::measured(study, i, events)?.into_iter().enumerate() {
+            let (x, y, side) = (patch.x, patch.y, patch.size);
+            let at = centre(&patch, size);
+            let truth = true_psf(&study.made.tsfs[i], at, RADIUS);
+            let by_tsf = true_psf(&study.joint.tsfs[i], at, RADIUS);
+            let of = |p: &Plane| (error(p, &truth), error(&smoothed(p), &smoothed(&truth)));
+            let (direct, global) = (of(&psf.values), of(&by_tsf));
+            let wide = Psf { radius: RADIUS, values: truth.clone() }.extent();
+            table += &format!(
+                "| {} | ({x}, {y}), {side} px | {wide:.1} | {:.2} | {:.2} | {:.2} | {:.2} |\n",
+                seconds(time).to_lowercase(),
+                direct.0,
+                direct.1,
+                global.0,
+                global.1
+            );
+            errors.push([direct.0, direct.1, global.0, global.1]);
+            frame(&mut marked, &patch);
             if k < SHOWN {
-                strips[0].push((
-                    format!("PATCH {}", k + 1),
-                    imageops::crop_imm(&photo, x as u32, y as u32, size as u32, size as u32).to_image(),
-                ));
+                strips[0].push((format!("PATCH {}", k + 1), cut(&photo, &patch)));
                 strips[1].push(("TRUE PSF".into(), sheet::grey(&truth)));
-                strips[2].push((format!("ESTIMATED: {raw:.2}"), sheet::grey(&estimated)));
+                strips[2].push((format!("EQ. (11): {:.2}", direct.0), sheet::grey(&psf.values)));
+                strips[3].push((format!("OF THE TSF: {:.2}", global.0), sheet::grey(&by_tsf)));
             }
         }
-        let [a, b, c] = strips;
-        rows.push(vec![(format!("FRAME OF {} S AND ITS PATCHES", time), marked)]);
-        rows.extend([a, b, c]);
+        rows.push(vec![(format!("FRAME OF {} AND ITS PATCHES", seconds(time)), marked)]);
+        rows.extend(strips);
     }
-    let median = |of: fn(&(f64, f64)) -> f64| -> f64 {
-        let mut v: Vec<f64> = errors.iter().map(of).collect();
-        v.sort_by(f64::total_cmp);
-        v.get(v.len() / 2).copied().unwrap_or(f64::NAN)
-    };
-    table += &format!("| median | | | {:.2} | {:.2} |", median(|e| e.0), median(|e| e.1));
+    let of = |k: usize| median(errors.iter().map(|e| e[k]).collect());
+    table += &format!("| median | | | {:.2} | {:.2} | {:.2} | {:.2} |", of(0), of(1), of(2), of(3));
     Ok(Report {
         title: "Figure 3: local PSFs, true and estimated".into(),
         text: format!(
-            "Scene chart, {w} x {h} pixels, 1/2 and 2 s shaken by TSFs on the paper's grid. The paper chooses patches by hand and shows PSFs side by side \
-             without figures; here patches are chosen by the program, and the error is the norm of the difference over the norm of the true PSF. \
-             The true PSF is eq. (5) at the patch's centre."
+            "Scene chart, {}; TSFs on the paper's grid. Patches are chosen by the program; the paper chooses by hand and shows PSFs side by side without figures. \
+             The error is the norm of the difference over the norm of the true PSF, which is eq. (5) at the patch's centre. Eq. (11) is solved for each patch by \
+             itself against the denoised sharp frames, non-negative; 'the TSF's' is eq. (5) of the TSF that the program finds from the whole frame.",
+            study.camera
         ),
         table,
         picture: sheet::sheet(&rows, 190),
     })
 }
 
+pub(super) fn blind(lab: &mut Lab, events: Events) -> Result<Report> {
+    let study = lab.study((Drawn::Chart, Exposures::Shaken3, Shaking::Grid), events)?;
+    let (w, h) = study.made.bracket.size();
+    // Two frames, as the paper: the two longest differ in blur and both see the patches.
+    let pair = [1, 2];
+    let frames = pair.map(|i| study.made.bracket.frames()[i].clone()).to_vec();
+    let settings = Settings { blind: Blind::Joint, ..Settings::default() };
+    let found = Joint::new(&Bracket::new(frames)?, &study.response, &settings, None, events)?;
+    // What lies where is the same for both frames of a patch, and is not known: scene and PSFs may be shifted together.
+    let latent = study.joint.irradiance.mean();
+    let (_, weight) = local::seen(study, pair[1], &latent);
+    let side = (w / 3).min(120);
+    let patches = crate::psf::choose(&latent, &weight, side, 3);
+    let mut table =
+        String::from("| patch at | frame | true width (px) | estimated width | error | 1 px smoothed |\n|---|---|---|---|---|---|\n");
+    let mut rows: Vec<Vec<(String, RgbImage)>> = vec![Vec::new(), Vec::new(), Vec::new()];
+    let mut errors = Vec::new();
+    for patch in &patches {
+        let at = centre(patch, (w, h));
+        let truth = pair.map(|i| true_psf(&study.made.tsfs[i], at, RADIUS));
+        let shifted = |s: DVec2| -> [Plane; 2] { std::array::from_fn(|k| moved(&true_psf(&found.tsfs[k], at, RADIUS + 8), RADIUS, s)) };
+        let cost = |s: DVec2| shifted(s).iter().zip(&truth).map(|(a, b)| error(&smoothed(a), &smoothed(b)).powi(2)).sum::<f64>();
+        let (mut best, mut step) = (DVec2::ZERO, 2.0);
+        while step > 0.05 {
+            let around = (-2..=2).flat_map(|j| (-2..=2).map(move |i| (i, j)));
+            let tried = around.map(|(i, j)| best + step * DVec2::new(f64::from(i), f64::from(j)));
+            best = tried.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(best);
+            step *= 0.5;
+        }
+        for (k, estimated) in shifted(best).into_iter().enumerate() {
+            let i = pair[k];
+            let (raw, smooth) = (error(&estimated, &truth[k]), error(&smoothed(&estimated), &smoothed(&truth[k])));
+            let width = |p: &Plane| Psf { radius: RADIUS, values: p.clone() }.extent();
+            table += &format!(
+                "| ({}, {}), {side} px | {} | {:.1} | {:.1} | {raw:.2} | {smooth:.2} |\n",
+                patch.x,
+                patch.y,
+                seconds(study.times()[i]).to_lowercase(),
+                width(&truth[k]),
+                width(&estimated)
+            );
+            errors.push((raw, smooth));
+            rows[0].push((format!("PATCH, {}", seconds(study.times()[i])), cut(&study.photo(i), patch)));
+            rows[1].push((format!("ESTIMATED: {raw:.2}"), sheet::grey(&estimated)));
+            rows[2].push(("TRUE PSF".into(), sheet::grey(&truth[k])));
+        }
+    }
+    let of = |f: fn(&(f64, f64)) -> f64| median(errors.iter().map(f).collect());
+    table += &format!("| median | | | | {:.2} | {:.2} |", of(|e| e.0), of(|e| e.1));
+    let mut all = vec![pair.map(|i| (format!("FRAME OF {}", seconds(study.times()[i])), study.photo(i))).to_vec()];
+    all.extend(rows);
+    Ok(Report {
+        title: "Figure 4: PSFs from two blurred frames".into(),
+        text: format!(
+            "Scene chart, {}; TSFs on the paper's grid. From the two longest frames alone, of which neither is sharp, the program finds the irradiance and both TSFs together; \
+             the PSFs are eq. (5) of these. The paper estimates each patch by itself (eq. 12). Scene and PSFs may be shifted together without any change in the frames: \
+             each patch's pair of PSFs is compared after the one shift that suits both best. The error is the norm of the difference over the norm of the true PSF.{}",
+            study.camera,
+            if found.report["blind"]["believed"].as_bool() == Some(true) {
+                ""
+            } else {
+                " The blurs were not found: the PSFs are those of a merge."
+            }
+        ),
+        table,
+        picture: sheet::sheet(&all, 190),
+    })
+}
+
+/// The middle of `psf`, up to `radius`, after a shift by `s` pixels.
+fn moved(psf: &Plane, radius: usize, s: DVec2) -> Plane {
+    let offset = (psf.width / 2) as f64 - radius as f64;
+    let inside = |x: f64, y: f64| {
+        if x < 0.0 || y < 0.0 || x >= psf.width as f64 || y >= psf.height as f64 { 0.0 } else { f64::from(psf.at(x as usize, y as usize)) }
+    };
+    Plane::from_fn(2 * radius + 1, 2 * radius + 1, |x, y| {
+        let (u, v) = (x as f64 + offset - s.x, y as f64 + offset - s.y);
+        let (i, j) = (u.floor(), v.floor());
+        let (a, b) = (u - i, v - j);
+        let row = |j: f64| (1.0 - a) * inside(i, j) + a * inside(i + 1.0, j);
+        ((1.0 - b) * row(j) + b * row(j + 1.0)) as f32
+    })
+}
+
+fn cut(photo: &RgbImage, patch: &Patch) -> RgbImage {
+    imageops::crop_imm(photo, patch.x as u32, patch.y as u32, patch.size as u32, patch.size as u32).to_image()
+}
+
 /// A light frame round a patch.
-fn frame(image: &mut RgbImage, x: u32, y: u32, size: u32) {
+fn frame(image: &mut RgbImage, patch: &Patch) {
+    let (x, y, size) = (patch.x as u32, patch.y as u32, patch.size as u32);
     for k in 0..size {
         for (u, v) in [(x + k, y), (x + k, y + size - 1), (x, y + k), (x + size - 1, y + k)] {
             if u < image.width() && v < image.height() {

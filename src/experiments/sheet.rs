@@ -42,3 +42,27 @@ pub(super) fn grey(plane: &Plane) -> RgbImage {
         image::Rgb([((plane.at(x as usize, y as usize).max(0.0) / most).sqrt() * 255.0) as u8; 3])
     })
 }
+
+/// Curves over time, red, green and blue, on one scale with zero in the middle.
+pub(super) fn graph(curves: &[Vec<f64>]) -> RgbImage {
+    const COLOURS: [[u8; 3]; 3] = [[235, 90, 80], [90, 200, 100], [100, 140, 255]];
+    let (w, h) = (256u32, 120u32);
+    let mut out = RgbImage::from_pixel(w, h, image::Rgb([44, 44, 48]));
+    for x in 0..w {
+        out.put_pixel(x, h / 2, image::Rgb([110; 3]));
+    }
+    let most = curves.iter().flatten().fold(1e-9f64, |m, v| m.max(v.abs()));
+    for (curve, colour) in curves.iter().zip(COLOURS) {
+        let place = |x: u32| {
+            let v = curve[(x as usize * curve.len() / w as usize).min(curve.len() - 1)];
+            (f64::from(h) * (0.5 - 0.47 * v / most)).clamp(0.0, f64::from(h - 1)) as u32
+        };
+        for x in 0..w.min(if curve.is_empty() { 0 } else { w }) {
+            let (a, b) = (place(x), place(x.saturating_sub(1)));
+            for y in a.min(b)..=a.max(b) {
+                out.put_pixel(x, y, image::Rgb(colour));
+            }
+        }
+    }
+    out
+}

@@ -167,8 +167,17 @@ pub fn read(path: &Path) -> Result<(Rgb, Option<f64>)> {
 /// # Errors
 /// As [`read()`].
 pub fn read_file(path: &Path) -> Result<File> {
-    let bytes = super::read_bytes(path)?;
+    decode(path, super::read_bytes(path)?)
+}
+
+/// [`read_file`] of bytes that are read already; `path` is named in errors.
+pub(super) fn decode(path: &Path, bytes: Vec<u8>) -> Result<File> {
     let format = |reason: String| Error::Format { path: path.into(), reason };
+    let kind = |e: ::exr::error::Error| format(format!("is not an OpenEXR file with R, G and B channels ({e})"));
+    let headers = ::exr::meta::MetaData::read_from_buffered(bytes.as_slice(), false).map_err(kind)?.headers;
+    for header in &headers {
+        super::check_size(header.layer_size.width(), header.layer_size.height(), bytes.len()).map_err(format)?;
+    }
     let image = ::exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
@@ -182,7 +191,7 @@ pub fn read_file(path: &Path) -> Result<File> {
         .first_valid_layer()
         .all_attributes()
         .from_buffered(std::io::Cursor::new(bytes))
-        .map_err(|e| format(format!("is not an OpenEXR file with R, G and B channels ({e})")))?;
+        .map_err(kind)?;
     let to_xyz = match &image.attributes.chromaticities {
         None => Primaries::Rec709.to_xyz(),
         Some(c) => {

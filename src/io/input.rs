@@ -72,10 +72,17 @@ pub fn notes(path: &Path) -> Result<Metadata> {
 /// [`Error::Read`] when the file cannot be opened; [`Error::Format`] when it is damaged, of an unsupported kind, or holds NaN, with the
 /// remedy.
 pub fn read(path: &Path, white: f32) -> Result<Input> {
-    let bytes = super::read_bytes(path)?;
+    decode(path, super::read_bytes(path)?, white)
+}
+
+/// [`read`] of bytes that are read already; `path` tells the kind of camera raw files by its ending, and is named in errors.
+///
+/// # Errors
+/// [`Error::Format`] as [`read`].
+pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
     let refuse = |reason: String| Error::Format { path: path.into(), reason };
     if bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]) {
-        let file = exr::read_file(path)?;
+        let file = exr::decode(path, bytes)?;
         return linear(path, file.image, white, file.to_xyz, file.metadata);
     }
     if bytes.starts_with(b"#?") {
@@ -146,7 +153,7 @@ pub fn read_linear(path: &Path) -> Result<Linear> {
         let to_xyz = profile.map_or_else(|| Primaries::Rec709.to_xyz(), |p| p.to_xyz);
         return Ok(Linear { image: picture.intensity, to_xyz, metadata: metadata::read_bytes(&bytes) });
     }
-    let file = exr::read_file(path)?;
+    let file = exr::decode(path, bytes)?;
     Ok(Linear { image: file.image, to_xyz: file.to_xyz, metadata: file.metadata })
 }
 
@@ -169,6 +176,8 @@ fn linear(path: &Path, image: Rgb, white: f32, to_xyz: Matrix, metadata: Metadat
 fn radiance(bytes: &[u8]) -> std::result::Result<Rgb, String> {
     let damaged = |e: ::image::ImageError| format!("is a truncated or damaged Radiance HDR file ({e}); make it again");
     let decoder = ::image::codecs::hdr::HdrDecoder::new(std::io::Cursor::new(bytes)).map_err(damaged)?;
+    let (width, height) = ::image::ImageDecoder::dimensions(&decoder);
+    super::check_size(width as usize, height as usize, bytes.len())?;
     let picture = ::image::DynamicImage::from_decoder(decoder).map_err(damaged)?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
     Ok(ldr::planes(&picture.into_rgb32f().into_raw(), width, height, 1.0f32))

@@ -52,8 +52,10 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
     if reader.format() == Some(ImageFormat::Jpeg) && !jpeg_is_complete(bytes) {
         return Err(format("is truncated; copy it again from the camera".into()));
     }
+    let mut decoder = reader.into_decoder().map_err(|e| format(reason(&e)))?;
+    let (width, height) = decoder.dimensions();
+    super::check_size(width as usize, height as usize, bytes.len()).map_err(format)?;
     let decode = || -> std::result::Result<(DynamicImage, Option<Vec<u8>>), ImageError> {
-        let mut decoder = reader.into_decoder()?;
         let mut limits = Limits::default();
         limits.max_alloc = Some(MAX_DECODED_BYTES);
         decoder.set_limits(limits)?;

@@ -40,6 +40,8 @@ pub struct Metadata {
     pub altitude: Option<f64>,
     /// Focal length in millimetres.
     pub focal_mm: Option<f64>,
+    /// Noise of the sensor at this speed (NoiseProfile of DNG files): [S, O], variance = S x + O of a value x whose white is 1.
+    pub noise: Option<[f64; 2]>,
     /// The fields that a result inherits from its reference frame ([`CARRIED`], and all of the GPS block).
     pub(super) carried: Vec<Field>,
 }
@@ -134,11 +136,13 @@ fn of(exif: &Exif) -> Metadata {
     let fraction = text(exif, Tag::SubSecTimeOriginal).filter(|s| s.bytes().all(|b| b.is_ascii_digit()));
     let below_sea = exif.get_field(Tag::GPSAltitudeRef, In::PRIMARY).and_then(|f| f.value.get_uint(0)) == Some(1);
     Metadata {
-        exposure_time: number(exif, Tag::ExposureTime).or_else(|| number(exif, Tag::ShutterSpeedValue).map(|v| (-v).exp2())),
+        exposure_time: number(exif, Tag::ExposureTime)
+            .or_else(|| number(exif, Tag::ShutterSpeedValue).filter(|v| v.abs() <= 40.0).map(|v| (-v).exp2())),
         f_number: positive(Tag::FNumber),
         // 65535 stands for a speed that does not fit.
         iso: positive(Tag::PhotographicSensitivity).filter(|v| *v < 65535.0).or_else(|| positive(Tag::ISOSpeed)),
-        exposure_bias: number(exif, Tag::ExposureBiasValue),
+        // No camera compensates by more; and powers of more are no times.
+        exposure_bias: number(exif, Tag::ExposureBiasValue).filter(|v| v.abs() <= 40.0),
         orientation: number(exif, Tag::Orientation).map(|v| v as u32).filter(|v| (1..=8).contains(v)),
         taken: text(exif, Tag::DateTimeOriginal)
             .or_else(|| text(exif, Tag::DateTime))
@@ -153,10 +157,13 @@ fn of(exif: &Exif) -> Metadata {
         longitude: degrees(Tag::GPSLongitude, Tag::GPSLongitudeRef, "W"),
         altitude: number(exif, Tag::GPSAltitude).map(|v| if below_sea { -v } else { v }),
         focal_mm: positive(Tag::FocalLength),
+        noise: None,
         carried: exif
             .fields()
             .filter(|f| f.ifd_num == In::PRIMARY && (CARRIED.contains(&f.tag) || f.tag.context() == exif::Context::Gps))
             .filter(|f| !matches!(&f.value, Value::Unknown(..)) && size(&f.value) <= MOST_BYTES)
+            // A tag that comes twice counts once, here as above.
+            .filter(|f| exif.get_field(f.tag, In::PRIMARY).is_some_and(|first| std::ptr::eq(first, *f)))
             .cloned()
             .collect(),
     }
@@ -288,7 +295,7 @@ pub fn seconds(date: &str) -> Option<f64> {
     let mut parts = time.split(':');
     let (hour, minute) = (parts.next()?.parse::<f64>().ok()?, parts.next()?.parse::<f64>().ok()?);
     let second = parts.next()?.parse::<f64>().ok()?;
-    if !(1..=12).contains(&m) || !(1..=31).contains(&d) || y < 1 {
+    if !(1..=12).contains(&m) || !(1..=31).contains(&d) || !(1..=9999).contains(&y) {
         return None;
     }
     // Days since 1970-01-01 in the Gregorian calendar, years counted from March.

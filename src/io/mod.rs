@@ -3,11 +3,12 @@
 //! * [`input`] reads a frame of any kind: [`ldr`] (PNG, JPEG, TIFF), `raw` (camera raw files, feature `raw`), [`exr`], Radiance HDR;
 //!   [`metadata`] what the camera noted, [`icc`] what an embedded profile says of its colours;
 //! * [`exif`] writes frames with their exposure time;
-//! * [`exr`] and [`picture`] write results, linear or for display;
+//! * [`exr`], [`picture`] and [`gainmap`] write results, linear or for display;
 //! * [`output`] writes every result beside its target and renames it, so that nothing is ever half-written.
 
 pub mod exif;
 pub mod exr;
+pub mod gainmap;
 pub mod icc;
 pub mod input;
 pub mod ldr;
@@ -37,6 +38,20 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>> {
         return Err(Error::Format { path: path.into(), reason: "is a folder; name a file in it".into() });
     }
     std::fs::read(path).map_err(|e| Error::Read { path: path.into(), reason: plain(&e) })
+}
+
+/// Pixels per byte of a file that no compression of photographs reaches, nor of pictures that are even by a part.
+const LEAST_DENSE: usize = 4096;
+/// Pixels of the largest frame: 4 GiB of linear RGB.
+const MOST_PIXELS: usize = (4 << 30) / 12;
+
+/// Refuses a size that a damaged header claims before memory is asked for it, which would end the program. `bytes`: size of the file.
+fn check_size(width: usize, height: usize, bytes: usize) -> std::result::Result<(), String> {
+    let most = MOST_PIXELS.min(bytes.saturating_mul(LEAST_DENSE));
+    match width.checked_mul(height) {
+        Some(n) if n <= most && n > 0 => Ok(()),
+        _ => Err(format!("claims {width} x {height} pixels, which it cannot hold; it is damaged or too large")),
+    }
 }
 
 /// What the system said, without "(os error 2)".

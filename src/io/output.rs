@@ -133,6 +133,14 @@ impl Output {
         })
     }
 
+    /// Stages a picture as JPEG of `quality` with the gain map that makes it look like `linear`, see [`super::gainmap::write()`].
+    ///
+    /// # Errors
+    /// [`Error::Write`].
+    pub fn stage_gain_map(&self, picture: &::image::RgbImage, linear: &Rgb, quality: u8, noted: &Metadata) -> Result<Staged> {
+        self.stage(|to| super::gainmap::write(to, picture, linear, quality, Some(noted)))
+    }
+
     /// Stages text.
     ///
     /// # Errors

@@ -8,11 +8,12 @@ use crate::colour::{self, Matrix, Primaries};
 use crate::image::{Plane, Rgb};
 use crate::mask::CLIPPED;
 use rawler::decoders::{Decoder, Orientation, RawDecodeParams, WellKnownIFD};
+use rawler::formats::tiff::Value;
 use rawler::imgop::develop::{Intermediate, ProcessingStep, RawDevelop};
 use rawler::imgop::xyz::Illuminant;
 use rawler::rawimage::RawPhotometricInterpretation as Photometric;
 use rawler::rawsource::RawSource;
-use rawler::tags::TiffCommonTag;
+use rawler::tags::{DngTag, TiffCommonTag};
 use rawler::{RawImage, RawImageData};
 use std::cell::Cell;
 use std::panic::{self, AssertUnwindSafe};
@@ -48,10 +49,11 @@ pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
         check_size(decoder.as_ref(), source.buf().len())?;
         let raw = decoder.raw_image(&source, &params, false).map_err(|e| reason(&e))?;
         // Files that are no TIFF within (CR3, RAF) tell rawler alone.
-        let metadata = match decoder.raw_metadata(&source, &params) {
+        let mut metadata = match decoder.raw_metadata(&source, &params) {
             Ok(m) => complete(noted, &m),
             Err(_) => noted,
         };
+        metadata.noise = noise_profile(decoder.as_ref());
         develop(raw, metadata)
     })
     .unwrap_or_else(|| Err("is damaged, or of a kind that cannot be developed; copy it again from the camera, or convert it to DNG".into()))
@@ -120,6 +122,20 @@ fn check_size(decoder: &dyn Decoder, bytes: usize) -> Result<(), String> {
         return Err(format!("claims {} x {} pixels, more than it can hold; copy it again from the camera", samples[0], samples[1]));
     }
     Ok(())
+}
+
+/// NoiseProfile of a DNG file (DNG 1.4, tag 51041): pairs S, O for all colours or one for each, of which the mean is taken.
+fn noise_profile(decoder: &dyn Decoder) -> Option<[f64; 2]> {
+    let of = |place| match &decoder.ifd(place).ok()??.get_entry(DngTag::NoiseProfile)?.value {
+        Value::Double(v) => Some(v.clone()),
+        _ => None,
+    };
+    let values = of(WellKnownIFD::Raw).or_else(|| of(WellKnownIFD::Root))?;
+    let pairs: Vec<&[f64]> = values.chunks_exact(2).collect();
+    let sound = !pairs.is_empty() && pairs.iter().all(|p| p[0] > 0.0 && p[0] < 1.0 && p[1] >= 0.0 && p[1] < 1.0);
+    let mean = |k: usize| pairs.iter().map(|p| p[k]).sum::<f64>() / pairs.len() as f64;
+    // A black pixel without any noise would count without bound: a ten-thousandth of white is as good as none.
+    sound.then(|| [mean(0), mean(1).max(1e-8)])
 }
 
 fn reason(e: &rawler::RawlerError) -> String {

@@ -1,6 +1,6 @@
 //! Alignment of the truth to an estimate: what an all-blurred bracket yields may lie a few pixels and a fraction of a degree off.
 
-use super::{check, percentile};
+use super::{check, percentile, phase};
 use crate::error::Result;
 use crate::image::{Plane, Rgb};
 use nalgebra::{DMatrix, DVector};
@@ -28,19 +28,17 @@ pub struct Moved {
     pub roll_deg: f64,
 }
 
-/// Iterations at each scale at most.
-const ITERATIONS: usize = 100;
-/// Change of the correlation below which a scale is done.
-const TOLERANCE: f64 = 1e-8;
-/// Shorter side, in pixels, below which no coarser scale is made.
-const SMALLEST: usize = 48;
+/// Iterations at most.
+const ITERATIONS: usize = 300;
+/// Change of the correlation below which the climb ends.
+const TOLERANCE: f64 = 1e-7;
 /// Standard deviation in pixels of the Gaussian before alignment: noise must not attract.
 const SMOOTHING: f64 = 1.1;
 
-/// The truth resampled onto the grid of `estimate`, so that the estimate is judged as it is, and the motion found. The motion maximises
-/// the correlation of log luminance (G. Evangelidis and E. Psarakis, "Parametric Image Alignment Using Enhanced Correlation Coefficient
-/// Maximization", 2008), from coarse to fine; where nothing correlates better than staying, nothing moves. Resampled by Lanczos with
-/// four lobes, edge pixels repeated.
+/// The truth resampled onto the grid of `estimate`, so that the estimate is judged as it is, and the motion found. Candidates are staying,
+/// the shift of phase correlation, and what a climb from either finds that maximises the correlation of log luminance (G. Evangelidis
+/// and E. Psarakis, "Parametric Image Alignment Using Enhanced Correlation Coefficient Maximization", 2008); the one under which the
+/// whole pictures correlate best is taken, staying before any other. Resampled by Lanczos with four lobes, edge pixels repeated.
 ///
 /// # Errors
 /// [`crate::error::Error::Input`] for sizes that differ and for values that are negative or not finite.
@@ -50,19 +48,21 @@ pub fn align(estimate: &Rgb, truth: &Rgb, mode: Align) -> Result<(Rgb, Moved)> {
         return Ok((truth.clone(), Moved::default()));
     }
     let (a, b) = (log_luminance(estimate), log_luminance(truth));
-    let mut scales = vec![(a.clone(), b.clone())];
-    while let Some((a, b)) = scales.last().filter(|(a, _)| a.width.min(a.height) >= 2 * SMALLEST) {
-        scales.push((halved(a), halved(b)));
-    }
-    let mut motion = Moved::default();
-    for (i, (a, b)) in scales.iter().enumerate().rev() {
-        let k = f64::from(1u32 << i);
-        let found = climb(&smooth(a), &smooth(b), Moved { x: motion.x / k, y: motion.y / k, ..motion }, mode);
-        motion = Moved { x: found.x * k, y: found.y * k, ..found };
-    }
+    let (x, y) = phase::shift(&a, &b);
+    let (smooth_a, smooth_b) = (smooth(&a), smooth(&b));
     let likeness = |m: Moved| correlation(&a, &resampled(&b, m, bilinear));
-    if likeness(motion) <= likeness(Moved::default()) {
-        return Ok((truth.clone(), Moved::default()));
+    let mut best = (likeness(Moved::default()), Moved::default());
+    for start in [Moved::default(), Moved { x, y, roll_deg: 0.0 }] {
+        for m in [Some(start), climb(&smooth_a, &smooth_b, start, mode)].into_iter().flatten() {
+            let k = likeness(m);
+            if k > best.0 {
+                best = (k, m);
+            }
+        }
+    }
+    let motion = best.1;
+    if motion == Moved::default() {
+        return Ok((truth.clone(), motion));
     }
     let least = truth.0.iter().flat_map(|p| p.data.iter().copied()).fold(f32::INFINITY, f32::min);
     Ok((truth.map_planes(|p| resampled(p, motion, lanczos).map(|v| v.max(least))), motion))
@@ -73,13 +73,6 @@ fn log_luminance(image: &Rgb) -> Plane {
     let mean = image.mean();
     let floor = 1e-3 * percentile(mean.data.clone(), 99.0) + 1e-12;
     mean.map(|v| (f64::from(v) + floor).ln() as f32)
-}
-
-/// Half the size; pixel k is the mean of 2k and 2k + 1, so that centres stay centres for even sizes.
-fn halved(p: &Plane) -> Plane {
-    Plane::from_fn(p.width / 2, p.height / 2, |x, y| {
-        0.25 * (p.at(2 * x, 2 * y) + p.at(2 * x + 1, 2 * y) + p.at(2 * x, 2 * y + 1) + p.at(2 * x + 1, 2 * y + 1))
-    })
 }
 
 /// Gaussian of [`SMOOTHING`] on 5 x 5 pixels.
@@ -95,13 +88,13 @@ fn smooth(p: &Plane) -> Plane {
     pass(&pass(p, 1, 0), 0, 1)
 }
 
-/// Maximises the enhanced correlation coefficient of `a` and the moved `b` from `start`.
-fn climb(a: &Plane, b: &Plane, start: Moved, mode: Align) -> Moved {
+/// Climbs from `start` towards the largest enhanced correlation coefficient of `a` and the moved `b`; `None` where they have nothing in
+/// common.
+fn climb(a: &Plane, b: &Plane, start: Moved, mode: Align) -> Option<Moved> {
     let n = if mode == Align::Rigid { 3 } else { 2 };
     let (width, height) = a.size();
     let (cx, cy) = centre(a);
     let (mut motion, mut last) = (start, f64::NEG_INFINITY);
-    let mut best = start;
     for _ in 0..ITERATIONS {
         let (sin, cos) = motion.roll_deg.to_radians().sin_cos();
         // (template, warped, gradient along the parameters) where the moved pixel lies inside.
@@ -111,7 +104,7 @@ fn climb(a: &Plane, b: &Plane, start: Moved, mode: Align) -> Moved {
                 (0..width).filter_map(move |x| {
                     let (u, v) = (x as f64 - cx, y as f64 - cy);
                     let (p, q) = (cos * u - sin * v + motion.x + cx, sin * u + cos * v + motion.y + cy);
-                    if p < 1.0 || q < 1.0 || p > width as f64 - 2.0 || q > height as f64 - 2.0 {
+                    if p < 0.0 || q < 0.0 || p > width as f64 - 1.0 || q > height as f64 - 1.0 {
                         return None;
                     }
                     let gx = 0.5 * (bilinear(b, p + 1.0, q) - bilinear(b, p - 1.0, q));
@@ -122,7 +115,7 @@ fn climb(a: &Plane, b: &Plane, start: Moved, mode: Align) -> Moved {
             })
             .collect();
         if rows.len() < 100 {
-            return best;
+            return None;
         }
         let count = rows.len() as f64;
         let (ma, mb) = (rows.iter().map(|r| r.0).sum::<f64>() / count, rows.iter().map(|r| r.1).sum::<f64>() / count);
@@ -142,31 +135,29 @@ fn climb(a: &Plane, b: &Plane, start: Moved, mode: Align) -> Moved {
             }
         }
         let likeness = ab / (aa * bb).sqrt().max(1e-30);
-        if likeness > last {
-            best = motion;
-        }
-        if (likeness - last).abs() < TOLERANCE {
-            return best;
-        }
-        last = last.max(likeness);
-        let Some(inverse) = hessian.try_inverse() else { return best };
+        let inverse = hessian.try_inverse()?;
         let projected = &inverse * &gb;
         let above = bb - gb.dot(&projected);
         let below = ab - ga.dot(&projected);
         if below <= 0.0 {
-            return best;
+            return None;
         }
         let step: DVector<f64> = &inverse * (ga * (above / below) - &gb);
         if !step.iter().all(|v| v.is_finite()) {
-            return best;
+            return None;
         }
         motion.x += step[0];
         motion.y += step[1];
         if n == 3 {
             motion.roll_deg += step[2].to_degrees();
         }
+        // The last step is taken as well: it costs nothing and leads upwards.
+        if (likeness - last).abs() < TOLERANCE {
+            break;
+        }
+        last = likeness;
     }
-    best
+    Some(motion)
 }
 
 fn centre(p: &Plane) -> (f64, f64) {

@@ -2,6 +2,7 @@
 //! tone-mapped.
 
 mod align;
+mod phase;
 mod sharpness;
 mod ssim;
 

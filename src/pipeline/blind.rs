@@ -1,23 +1,27 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run};
-use crate::blind::{self, Frame, Start};
+use crate::blind::{self, Frame, Lack, PatchSetup, Start};
 use crate::deblur;
 use crate::error::{Error, Result};
 use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::merge;
-use crate::tsf::Tsf;
+use crate::psf::{Patch, Psf};
+use crate::triage::Verdict;
+use crate::tsf::{self, Tsf};
 use glam::DMat3;
 use serde_json::{Value, json};
 
 /// What is done when no frame is sharp.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Blind {
-    /// [`Blind::Joint`] when no frame is sharp.
+    /// [`Blind::Joint`] when no frame is sharp, and when none is surely sharp and the estimate finds that even the reference frame moved.
     Auto,
     /// Irradiance and the TSFs of all frames together, whatever the triage says of the frames.
     Joint,
+    /// The paper's path (section III-B), whatever the triage says of the frames: PSFs of pairs of patches, aligned; TSFs from them.
+    Patches,
     /// The frames are merged without deblurring when none is sharp: the default, while the joint estimate takes minutes and is not yet
     /// shown to gain on every bracket.
     #[default]
@@ -39,6 +43,18 @@ const SLIGHTLY: (f64, f64) = (0.8, 4.0);
 /// Weight of the faintest frame's mask in the merge that is returned instead.
 const LEAST_DETAIL: f64 = 0.1;
 
+/// Steepness of the sharpest edges up to which a frame that passes for sharp may be blurred by some pixels: frames blurred by 4 px and more
+/// measure up to 0.55, sharp ones 0.58 and more.
+const SURELY_STEEP: f64 = 0.57;
+/// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
+const SHAKEN: f64 = 1.5;
+
+/// Whether frames pass for sharp, but none surely.
+pub(super) fn doubtful(verdicts: &[Verdict], sharp: &[bool]) -> bool {
+    let steepest = verdicts.iter().zip(sharp).filter(|(_, s)| **s).map(|(v, _)| v.steepness).fold(f64::NEG_INFINITY, f64::max);
+    steepest.is_finite() && steepest < SURELY_STEEP
+}
+
 /// exp of the mean logarithm: no frame buys its fit with another's.
 fn geometric_mean(chi: &[f64]) -> f64 {
     let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
@@ -59,7 +75,7 @@ impl Run<'_> {
     fn aligned(&self, used: &[usize], masks: &[Plane]) -> (Vec<Rgb>, Vec<Plane>) {
         let seen = (0..masks.len()).map(|i| {
             if used.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i])
+                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], 0)
             } else {
                 (self.exposures[i].clone(), masks[i].clone())
             }
@@ -88,8 +104,58 @@ impl Run<'_> {
         Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h)))
     }
 
-    /// The joint estimate over the frames `used`; `None` when a merge explains them as well. Progress runs from `from` to `to`.
-    pub(super) fn joint(&mut self, used: &[usize], from: f32, to: f32) -> Result<Option<Found>> {
+    /// The TSFs of all of the frames `used` and a scene to start from; `None` when a merge explains them as well or, where the triage was
+    /// in doubt (`doubtful`), the reference frame hardly moved. Progress runs from `from` to `to`.
+    pub(super) fn all_blurs(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
+        if self.settings.blind == Blind::Patches { self.patches(used, from, to) } else { self.joint(used, doubtful, from, to) }
+    }
+
+    /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
+    fn patches(&mut self, used: &[usize], from: f32, to: f32) -> Result<Option<Found>> {
+        let (frames, _) = self.luminances(used);
+        let times = |k: &usize| self.bracket.frames()[used[*k]].exposure_time;
+        let shortest = (0..used.len()).min_by(|a, b| times(a).total_cmp(&times(b))).unwrap_or(0);
+        let reference = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)).unwrap_or(shortest);
+        let events = &mut self.events;
+        let found = blind::from_patches(&frames, reference, &PatchSetup::default(), &mut |f| {
+            events(Event::Progress { stage: "estimating the blurs of pairs of patches".into(), fraction: from + 0.9 * (to - from) * f })
+        });
+        let name = |k: usize| self.bracket.frames()[used[k]].name.clone();
+        let found = match found {
+            Ok(found) => found,
+            Err(Lack::Cancelled) => return Err(Error::Cancelled),
+            Err(Lack::Texture(k)) => {
+                self.degrade(format!(
+                    "{}: shares no patch of enough texture with {}, unclipped in both, to find its blur; the frames are merged without \
+                     deblurring (--blind joint may find more)",
+                    name(k),
+                    name(reference)
+                ))?;
+                return Ok(None);
+            }
+        };
+        let psfs = |k: usize| {
+            let one = |(p, h): &(Patch, Psf)| json!({ "x": p.x, "y": p.y, "size": p.size, "radius": h.radius, "values": h.values.data });
+            json!({ "frame": name(k), "psfs": found.psfs[k].iter().map(one).collect::<Vec<_>>() })
+        };
+        self.blind = json!({
+            "method": "patches",
+            "reference": name(reference),
+            "believed": true,
+            "reference_error": found.error,
+            "patches": (0..used.len()).map(psfs).collect::<Vec<_>>(),
+        });
+        let mut tsfs = vec![None; self.bracket.frames().len()];
+        for (&i, tsf) in used.iter().zip(&found.tsfs) {
+            self.motions[i] = tsf.centre();
+            tsfs[i] = Some(tsf.clone());
+        }
+        let start = self.start_from_tsfs(used, &tsfs)?;
+        Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference] }))
+    }
+
+    /// The joint estimate.
+    fn joint(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
         let (frames, merged) = self.luminances(used);
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         // The shortest frame is nearly always the least blurred.
@@ -106,33 +172,38 @@ impl Run<'_> {
                 Start { reference: k, luminance: alone.mean() }
             })
             .collect();
+        let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
         let found = blind::estimate(&frames, &starts, (&merged.mean(), &still), &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
-            events(Event::Progress {
-                stage: format!("no frame is sharp: estimating all blurs{size}"),
-                fraction: from + (to - from) * s.fraction,
-            })
+            events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
         let (joint, alone) = (geometric_mean(&found.held_out), geometric_mean(&found.held_out_merge));
-        let believed = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
+        let (w, h) = self.bracket.size();
+        let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
+        let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
+        let believed = explained && (!doubtful || extents.iter().all(|e| *e > SHAKEN));
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],
             "believed": believed,
+            "in_doubt": doubtful,
+            "extent_px": extents,
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
         });
+        if !believed && doubtful {
+            return Ok(None);
+        }
         if !believed {
-            self.warn(format!(
+            self.degrade(format!(
                 "no frame is sharp, and camera shake explains the frames no better than a merge (residuals {joint:.1} against {alone:.1} \
                  times the noise): they are merged without deblurring, the least blurred weighted most"
             ))?;
             return Ok(None);
         }
-        let (w, h) = self.bracket.size();
         let luminance = found.luminance.crop(found.pad, found.pad, w, h);
         // The colours as the TSFs place the frames.
         for (&i, tsf) in used.iter().zip(&found.tsfs) {

@@ -1,8 +1,10 @@
-//! Local PSFs h of a blurred frame against a sharp reference (section III-A). No poses.
+//! Local PSFs h of a blurred frame against a sharp reference (section III-A) or of two shaken frames (III-B). No poses.
 
+mod blind;
 mod paired;
 mod patch;
 
+pub use blind::{Pair, Setup, estimate_pair};
 pub use paired::{Measured, estimate, estimate_within};
 pub use patch::{Patch, around, choose};
 

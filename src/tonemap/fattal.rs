@@ -1,7 +1,11 @@
 //! Gradient-domain compression: gradients attenuated at all scales, then the picture whose gradients come closest.
 
+use super::filter::transposed;
 use crate::image::Plane;
 use rayon::prelude::*;
+use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+use std::sync::Arc;
 
 /// Smallest side of the coarsest level.
 const COARSEST: usize = 32;
@@ -78,17 +82,6 @@ fn halved(p: &Plane) -> Plane {
     Plane { width: nw, height: nh, data }
 }
 
-/// Sums of 2 x 2 pixels, of those that there are.
-fn gathered(p: &Plane) -> Plane {
-    let (w, h) = p.size();
-    let (nw, nh) = (w.div_ceil(2), h.div_ceil(2));
-    let sum = |i: usize| {
-        let (x, y) = (2 * (i % nw), 2 * (i / nw));
-        (y..(y + 2).min(h)).map(|y| (x..(x + 2).min(w)).map(|x| p.at(x, y)).sum::<f32>()).sum()
-    };
-    Plane { width: nw, height: nh, data: (0..nw * nh).into_par_iter().map(sum).collect() }
-}
-
 /// Value of the next coarser level at a pixel of the finer one, bilinear between cell centres.
 fn interpolated(coarse: &Plane, x: usize, y: usize) -> f32 {
     let (w, h) = coarse.size();
@@ -98,95 +91,85 @@ fn interpolated(coarse: &Plane, x: usize, y: usize) -> f32 {
     0.5625 * coarse.at(a, b) + 0.1875 * (coarse.at(c, b) + coarse.at(a, d)) + 0.0625 * coarse.at(c, d)
 }
 
-/// Cycles after which nothing changes that 8 bits would show.
-const CYCLES: usize = 6;
-
-/// Solves Δu = `f` without flow over the border, by multigrid V-cycles.
-pub(super) fn poisson(f: &Plane) -> Plane {
-    let mut u = Plane::filled(f.width, f.height, 0.0);
-    // The border lets nothing out: what flows in sums to zero but for rounding.
-    let f = without_mean(f);
-    for _ in 0..CYCLES {
-        cycle(&mut u, &f);
-    }
+/// Solves Δu = `f` (five-point stencil, no flow over the border) up to a constant, exactly: the cosines of the DCT-II are its
+/// eigenvectors, of the eigenvalues 2 cos(π i/w) + 2 cos(π j/h) − 4. A mean of `f`, which has no solution, is left out.
+fn poisson(f: &Plane) -> Plane {
+    let (w, h) = f.size();
+    let across = Cosines::new(w);
+    let down = Cosines::new(h);
+    let mut u = f.clone();
+    across.forward(&mut u);
+    let mut u = transposed(&u);
+    down.forward(&mut u);
+    let eigenvalues = |n: usize| (0..n).map(|i| 2.0 * (std::f64::consts::PI * i as f64 / n as f64).cos() - 2.0).collect::<Vec<f64>>();
+    let (of_columns, of_rows) = (eigenvalues(w), eigenvalues(h));
+    u.data.par_chunks_exact_mut(h).zip(&of_columns).for_each(|(column, own)| {
+        for (v, other) in column.iter_mut().zip(&of_rows) {
+            let value = own + other;
+            *v = if value < 0.0 { (f64::from(*v) / value) as f32 } else { 0.0 };
+        }
+    });
+    down.inverse(&mut u);
+    let mut u = transposed(&u);
+    across.inverse(&mut u);
     u
 }
 
-fn without_mean(p: &Plane) -> Plane {
-    let mean = (p.data.par_iter().map(|v| f64::from(*v)).sum::<f64>() / p.data.len() as f64) as f32;
-    Plane { width: p.width, height: p.height, data: p.data.par_iter().map(|v| v - mean).collect() }
+/// DCT-II of rows of one length, and its inverse, through a real FFT of that length (J. Makhoul, "A Fast Cosine Transform in One and Two
+/// Dimensions", 1980).
+struct Cosines {
+    n: usize,
+    to: Arc<dyn RealToComplex<f32>>,
+    from: Arc<dyn ComplexToReal<f32>>,
+    /// exp(−iπk/2n), k = 0..=n/2.
+    turn: Vec<Complex<f32>>,
 }
 
-fn cycle(u: &mut Plane, f: &Plane) {
-    let (w, h) = f.size();
-    if w.min(h) < 4 {
-        // A few pixels one way may be many the other; relaxation alone reaches only so far, and what is left is invisible.
-        for _ in 0..(4 * w.max(h)).min(400) {
-            relax(u, f);
-        }
-        return;
+impl Cosines {
+    fn new(n: usize) -> Self {
+        let mut planner = RealFftPlanner::new();
+        let angle = |k: usize| -std::f64::consts::PI * k as f64 / (2 * n) as f64;
+        let turn = (0..=n / 2).map(|k| Complex::new(angle(k).cos() as f32, angle(k).sin() as f32)).collect();
+        Self { n, to: planner.plan_fft_forward(n), from: planner.plan_fft_inverse(n), turn }
     }
-    for _ in 0..2 {
-        relax(u, f);
-    }
-    let residual = residual(u, f);
-    // The flow into a coarse cell is the sum of the flows into its pixels, so that nothing is lost at odd borders; at twice the spacing
-    // the stencil's 1/h² is a quarter, and four pixels are one cell.
-    let coarse = without_mean(&gathered(&residual));
-    let mut correction = Plane::filled(coarse.width, coarse.height, 0.0);
-    cycle(&mut correction, &coarse);
-    u.data.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
-        for (x, v) in row.iter_mut().enumerate() {
-            *v += interpolated(&correction, x, y);
-        }
-    });
-    for _ in 0..2 {
-        relax(u, f);
-    }
-}
 
-/// Number of neighbours and their sum.
-#[inline]
-fn around(u: &[f32], w: usize, h: usize, x: usize, y: usize) -> (f32, f32) {
-    let i = y * w + x;
-    let (mut n, mut sum) = (0.0, 0.0);
-    if x > 0 {
-        (n, sum) = (n + 1.0, sum + u[i - 1]);
-    }
-    if x + 1 < w {
-        (n, sum) = (n + 1.0, sum + u[i + 1]);
-    }
-    if y > 0 {
-        (n, sum) = (n + 1.0, sum + u[i - w]);
-    }
-    if y + 1 < h {
-        (n, sum) = (n + 1.0, sum + u[i + w]);
-    }
-    (n, sum)
-}
-
-/// One damped Jacobi step; 0.8 damps what the coarse grid cannot see best.
-fn relax(u: &mut Plane, f: &Plane) {
-    let (w, h) = f.size();
-    let before = u.data.clone();
-    u.data.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
-        for (x, v) in row.iter_mut().enumerate() {
-            let (n, sum) = around(&before, w, h, x, y);
-            if n > 0.0 {
-                *v += 0.8 * ((sum - f.data[y * w + x]) / n - *v);
+    /// Rows x become C[k] = Σ x[m] cos(πk(2m + 1)/2n).
+    fn forward(&self, plane: &mut Plane) {
+        let n = self.n;
+        let buffers = || (self.to.make_input_vec(), self.to.make_output_vec(), self.to.make_scratch_vec());
+        plane.data.par_chunks_exact_mut(n).for_each_init(buffers, |(v, spectrum, scratch), row| {
+            // The even samples, then the odd ones backwards.
+            for (m, x) in row.iter().enumerate() {
+                v[if m.is_multiple_of(2) { m / 2 } else { n - 1 - m / 2 }] = *x;
             }
-        }
-    });
-}
+            self.to.process_with_scratch(v, spectrum, scratch).expect("the buffers are the plan's own");
+            for (k, (s, t)) in spectrum.iter().zip(&self.turn).enumerate() {
+                let c = s * t;
+                row[k] = c.re;
+                if k > 0 {
+                    row[n - k] = if 2 * k == n { c.re } else { -c.im };
+                }
+            }
+        });
+    }
 
-fn residual(u: &Plane, f: &Plane) -> Plane {
-    let (w, h) = f.size();
-    let mut out = Plane::filled(w, h, 0.0);
-    out.data.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
-        for (x, v) in row.iter_mut().enumerate() {
-            let (n, sum) = around(&u.data, w, h, x, y);
-            *v = f.data[y * w + x] - (sum - n * u.data[y * w + x]);
-        }
-    });
-    out
+    /// What [`Self::forward`] undoes.
+    fn inverse(&self, plane: &mut Plane) {
+        let n = self.n;
+        let buffers = || (self.from.make_output_vec(), self.from.make_input_vec(), self.from.make_scratch_vec());
+        plane.data.par_chunks_exact_mut(n).for_each_init(buffers, |(v, spectrum, scratch), row| {
+            for (k, (s, t)) in spectrum.iter_mut().zip(&self.turn).enumerate() {
+                *s = t.conj() * Complex::new(row[k], if k > 0 { -row[n - k] } else { 0.0 });
+            }
+            // Real but for rounding, which the transform refuses.
+            spectrum[0].im = 0.0;
+            if n.is_multiple_of(2) {
+                spectrum[n / 2].im = 0.0;
+            }
+            self.from.process_with_scratch(spectrum, v, scratch).expect("the buffers are the plan's own, real where they must be");
+            for (m, x) in row.iter_mut().enumerate() {
+                *x = v[if m.is_multiple_of(2) { m / 2 } else { n - 1 - m / 2 }] / n as f32;
+            }
+        });
+    }
 }

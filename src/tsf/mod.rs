@@ -1,6 +1,8 @@
 //! Transformation spread functions (section II-B): which poses the camera went through and for how long.
 
 mod active_set;
+mod align_across;
+mod align_within;
 mod continuous;
 mod estimate;
 mod from_psfs;
@@ -8,6 +10,8 @@ mod model;
 mod taps;
 mod whole_frame;
 
+pub use align_across::{align_across, blurred};
+pub use align_within::{Within, align_within, psf_at, shifted};
 pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
 pub use model::Model;
@@ -73,7 +77,7 @@ impl Tsf {
 
     /// Whether the frame is the latent scene itself (single pose, nothing moves).
     pub fn is_identity(&self) -> bool {
-        self.base == DMat3::IDENTITY && matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
+        self.base.abs_diff_eq(DMat3::IDENTITY, 1e-9) && matches!(self.poses.as_slice(), [p] if Pose { weight: 1.0, ..*p } == Pose::IDENTITY)
     }
 
     /// Where the frame of a single pose lies (frame from reference, centred pixels); `None` for a blurred frame.

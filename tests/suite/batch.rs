@@ -81,6 +81,15 @@ fn brackets_are_found_by_time_size_and_exposure() {
     assert!(said.out.contains("# photos/p7.jpg: is alone") && said.out.contains("# photos/z.png: notes no exposure"), "{}", said.out);
     assert!(said.out.contains("Maker Model 1; +0.0, +3.0 EV"), "{}", said.out);
     assert!(!dir.path().join("out").exists(), "a dry run writes nothing");
+    // A file of the same name in another folder.
+    let other = dir.path().join("more");
+    std::fs::create_dir(&other).unwrap();
+    for name in ["p1.jpg", "p2.jpg"] {
+        std::fs::copy(dir.path().join("photos").join(name), other.join(name)).unwrap();
+    }
+    let two = unshaken(dir.path(), &["batch", "photos", "more", "--output-dir", "out", "--dry-run"]);
+    let names: Vec<&str> = two.out.lines().filter_map(|l| l.strip_prefix("name = ")).collect();
+    assert_eq!(names, ["\"more-p1\"", "\"photos-p1\"", "\"p3\"", "\"p5\""]);
     // A shorter gap than the pause between the frames.
     let said = unshaken(dir.path(), &["batch", "photos", "--output-dir", "out", "--dry-run", "--gap", "0.2"]);
     assert!(!said.out.contains("[[bracket]]"), "{}", said.out);
@@ -201,6 +210,48 @@ fn configuration_preset_and_command_line_in_that_order() {
     assert!(said.code == Some(2) && said.err.contains("archive"), "{}", said.err);
 }
 
+/// Every option of merge can stand in a configuration, and takes effect.
+#[test]
+fn a_configuration_holds_every_option_of_merge() {
+    let dir = tempdir().unwrap();
+    let help = unshaken(dir.path(), &["merge", "--help"]).out;
+    let options: Vec<(String, bool)> = help
+        .lines()
+        .map(str::trim_start)
+        .filter(|l| l.starts_with('-'))
+        .filter_map(|l| l.split_once("--").map(|(_, rest)| rest))
+        .map(|rest| {
+            let name = rest.split(|c: char| !(c.is_ascii_lowercase() || c == '-')).next().unwrap();
+            (name.to_string(), rest.contains('<'))
+        })
+        // One run's files and what is no option of the merge itself.
+        .filter(|(name, _)| !["output", "config", "preset", "print-config", "help", "version", "quiet", "json"].contains(&name.as_str()))
+        .collect();
+    assert!(options.len() > 25, "{options:?}");
+    let print = |arguments: &[&str]| unshaken(dir.path(), &[&["merge", "--print-config"], arguments].concat());
+    let empty = print(&["--config", "none"]).out;
+    for (name, valued) in &options {
+        assert!(empty.lines().any(|l| l.trim_start_matches("# ").starts_with(&format!("{name} = "))), "--print-config lacks {name}");
+        let value = if !valued {
+            "true"
+        } else if name == "interpolation" {
+            "\"six-point\""
+        } else {
+            "\"7\""
+        };
+        std::fs::write(dir.path().join("c.toml"), format!("{name} = {value}\n")).unwrap();
+        let said = print(&["--config", "c.toml"]);
+        assert_eq!(said.code, Some(0), "{name}: {}", said.err);
+        let read: toml::Table = said.out.parse().unwrap();
+        let text = read[name].to_string();
+        assert!(text == value || text == format!("[{value}]"), "{name}: {text}");
+    }
+    // Options that may be given several times are lists of their own.
+    std::fs::write(dir.path().join("c.toml"), "patch = [\"3,4\", \"5,6\"]\n").unwrap();
+    let read: toml::Table = print(&["--config", "c.toml"]).out.parse().unwrap();
+    assert_eq!(read["patch"].to_string(), "[\"3,4\", \"5,6\"]");
+}
+
 #[test]
 fn completions_and_the_manual_page_know_every_command() {
     let dir = tempdir().unwrap();
@@ -210,6 +261,13 @@ fn completions_and_the_manual_page_know_every_command() {
         for word in ["merge", "batch", "tonemap", "output-dir", "primaries", "shard"] {
             assert!(said.out.replace("\\-", "-").contains(word), "{what} lacks {word}");
         }
+    }
+    // bash takes its own and completes an option by it.
+    std::fs::write(dir.path().join("c.bash"), unshaken(dir.path(), &["generate", "bash"]).out).unwrap();
+    let script =
+        "source ./c.bash && COMP_WORDS=(unshaken merge --prim) COMP_CWORD=2 && _unshaken unshaken --prim merge && echo ${COMPREPLY[@]}";
+    if let Ok(out) = Command::new("bash").args(["-c", script]).current_dir(dir.path()).output() {
+        assert_eq!(String::from_utf8_lossy(&out.stdout).trim(), "--primaries", "{}", String::from_utf8_lossy(&out.stderr));
     }
     for command in ["merge", "batch"] {
         assert!(unshaken(dir.path(), &[command, "--help"]).out.contains("Examples:"), "{command}");
@@ -233,25 +291,122 @@ fn voices_quiet_and_json() {
     assert!(failed.code == Some(1) && failed.out.lines().last().unwrap().contains("\"event\":\"error\""), "{}", failed.out);
 }
 
-/// A bracket of which nothing can be deblurred: done, and degraded under --strict.
+/// On a terminal a bar with the stage and the time left, which is gone at the end; elsewhere a line per stage.
+#[cfg(target_os = "linux")]
 #[test]
-fn strict_tells_degraded_results_by_the_exit_code() {
+fn a_terminal_shows_a_bar_and_a_log_lines() {
+    let dir = album();
+    let line = "merge --overwrite --no-align --sharp 1,2 --response gamma:2.2 -o x.exr photos/p1.jpg photos/p2.jpg";
+    let plain = unshaken(dir.path(), &line.split(' ').collect::<Vec<_>>());
+    assert_eq!(plain.code, Some(0), "{}", plain.err);
+    assert!(plain.err.lines().any(|l| l == "merging the sharp frames") && !plain.err.contains('%'), "{}", plain.err);
+    // 'script' runs a command on a terminal of its own.
+    let command = format!("{} {line}", env!("CARGO_BIN_EXE_unshaken"));
+    let run = Command::new("script").args(["-qec", &command, "/dev/null"]).current_dir(dir.path()).stdin(Stdio::null()).output();
+    let Ok(out) = run else {
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), "SKIPPED a_terminal_shows_a_bar_and_a_log_lines: the command 'script' is not there");
+        return;
+    };
+    let shown = String::from_utf8_lossy(&out.stdout).into_owned();
+    assert_eq!(out.status.code(), Some(0), "{shown}");
+    assert!(shown.contains(" left  ") && shown.contains('%') && shown.contains("merging the sharp frames"), "{shown:?}");
+    assert!(shown.trim_end().lines().last().unwrap().contains("wrote x.exr"), "{shown:?}");
+}
+
+/// What the merge of a bracket says, and what of it makes a result less than it should be.
+#[test]
+fn strict_counts_degraded_results_and_no_other_warning() {
     let dir = album();
     let tsf = r#"{"format":"unshaken-tsf","version":1,"frames":[{"frame":"p1.jpg","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1}]}]}"#;
     std::fs::write(dir.path().join("tsf.json"), tsf).unwrap();
-    // The TSF file holds one frame of two: a warning of the merge.
     let merge = |more: &[&str]| {
-        unshaken(
-            dir.path(),
-            &[&["merge", "--overwrite", "--sharp", "1,2", "-o", "s.exr", "--tsf", "tsf.json"], more, &["photos/p1.jpg", "photos/p2.jpg"]]
-                .concat(),
-        )
+        let line = ["merge", "--overwrite", "--strict", "--json", "--response", "gamma:2.2", "-o", "s.exr", "--report", "s.json"];
+        let said = unshaken(dir.path(), &[&line[..], more, &["photos/p1.jpg", "photos/p2.jpg"]].concat());
+        let report: Value = std::fs::read_to_string(dir.path().join("s.json")).map_or(Value::Null, |t| serde_json::from_str(&t).unwrap());
+        (said.code, said.out, report["degraded"].clone())
     };
-    let plain = merge(&[]);
-    assert!(plain.code == Some(0) && plain.err.contains("its TSF is estimated"), "{}", plain.err);
-    assert_eq!(merge(&["--strict"]).code, Some(3));
-    let fine = unshaken(dir.path(), &["merge", "--strict", "--sharp", "1,2", "-o", "t.exr", "photos/p1.jpg", "photos/p2.jpg"]);
-    assert_eq!(fine.code, Some(0), "a note about the response is no degradation: {}", fine.err);
+    // As asked, though something is said: a frame that the TSF file lacks, a frame that the user leaves out.
+    for (more, word) in [
+        (["--sharp", "1,2", "--tsf", "tsf.json"].as_slice(), "its TSF is estimated"),
+        (&["--sharp", "1", "--exclude", "2"], "leaves one frame"),
+    ] {
+        let (code, out, degraded) = merge(more);
+        assert!(code == Some(0) && out.contains("\"warning\"") && out.contains(word), "{code:?} {out}");
+        assert_eq!(degraded, serde_json::json!([]));
+    }
+    // Exposure times that the pixels contradict: 3 EV apart, said to be 1.
+    let (code, out, degraded) = merge(&["--no-align", "--sharp", "1,2", "--exposures", "1,2"]);
+    assert_eq!((code, degraded.as_array().map(Vec::len)), (Some(3), Some(1)), "{out}");
+    assert!(out.contains("\"degraded\":true") && out.contains("EV"), "{out}");
+    // The same among many: the batch is done, and says so by its code; also when it is all done already.
+    std::fs::write(
+        dir.path().join("m.toml"),
+        "[[bracket]]\nname = \"odd\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nexposures = \"1,2\"\nno-align = true\nsharp = [1, 2]\n",
+    )
+    .unwrap();
+    let batch = |more: &[&str]| {
+        let line = ["batch", "--manifest", "m.toml", "--output-dir", "out", "--response", "gamma:2.2"];
+        let said = unshaken(dir.path(), &[&line[..], more].concat());
+        (said.code, said.out)
+    };
+    let (code, out) = batch(&["--strict"]);
+    assert!(code == Some(3) && out.contains("degraded") && out.contains("1 degraded"), "{code:?} {out}");
+    let (code, out) = batch(&["--strict"]);
+    assert!(code == Some(3) && out.contains("skipped"), "{code:?} {out}");
+    assert_eq!(batch(&[]).0, Some(0));
+    // No frame left to be sharp.
+    let blurred =
+        r#"{"frame":"NAME","width":72,"height":56,"focal_px":80,"poses":[{"t_x":0,"t_y":0,"weight":1},{"t_x":2,"t_y":0,"weight":1}]}"#;
+    let both = ["p1.jpg", "p2.jpg"].map(|n| blurred.replace("NAME", n)).join(",");
+    std::fs::write(dir.path().join("tsf.json"), format!(r#"{{"format":"unshaken-tsf","version":1,"frames":[{both}]}}"#)).unwrap();
+    let (code, out, _) = merge(&["--tsf", "tsf.json"]);
+    assert_eq!(code, Some(0), "TSFs of all frames are known: {out}");
+}
+
+/// Killed in the middle of the second bracket: the first is not merged again, the second is, whatever lies there of it.
+#[cfg(unix)]
+#[test]
+fn a_batch_that_was_killed_goes_on_where_it_was() {
+    use std::io::{BufRead, BufReader};
+    let dir = album();
+    std::fs::write(
+        dir.path().join("m.toml"),
+        "[[bracket]]\nname = \"one\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\n\
+         [[bracket]]\nname = \"two\"\nframes = [\"photos/p3.jpg\", \"photos/p4.jpg\"]\n",
+    )
+    .unwrap();
+    let line = ["batch", "--manifest", "m.toml", "--output-dir", "out", "--json", "--sharp=1,2", "--response=gamma:2.2"];
+    let mut child = Command::new(env!("CARGO_BIN_EXE_unshaken"))
+        .current_dir(dir.path())
+        .args(line)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let begun = |l: &str| serde_json::from_str::<Value>(l).is_ok_and(|e| e["event"] == "bracket-started" && e["name"] == "two");
+    assert!(lines.any(|l| begun(&l.unwrap())));
+    let record = dir.path().join("out/.unshaken/two.json");
+    let start = Instant::now();
+    while !record.exists() && start.elapsed() < Duration::from_secs(20) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    // What its merge may have finished meanwhile.
+    std::fs::write(dir.path().join("out/two.exr"), "half").unwrap();
+    let said = unshaken(dir.path(), &line);
+    assert_eq!(said.code, Some(0), "{}{}", said.out, said.err);
+    let status = |name: &str| {
+        let events = said.out.lines().filter_map(|l| serde_json::from_str::<Value>(l).ok());
+        events
+            .filter(|e| e["event"] == "bracket" && e["name"] == name)
+            .map(|e| e["status"].as_str().unwrap().to_string())
+            .collect::<Vec<_>>()
+    };
+    assert_eq!((status("one"), status("two")), (vec!["skipped".to_string()], vec!["done".to_string()]), "{}", said.out);
+    assert!(std::fs::metadata(dir.path().join("out/two.exr")).unwrap().len() > 1000);
 }
 
 /// Ctrl-C in the middle: exit code 130, nothing new in the folder.

@@ -2,10 +2,11 @@
 
 use crate::oracle::blur as oracle;
 use crate::support::{assert_close, f64s, noise, uniform};
-use unshaken::blind::{self, Frame, Operator, Start, fix_warp};
+use unshaken::blind::{self, Frame, Lack, Operator, PatchSetup, Start, fix_warp};
 use unshaken::image::Plane;
-use unshaken::pose::Pose;
-use unshaken::tsf::{Interpolation, TapSet, Tsf};
+use unshaken::pose::{Pose, PoseGrid};
+use unshaken::psf::{self, Patch, Psf};
+use unshaken::tsf::{self, Interpolation, TapSet, Tsf};
 
 /// A path of `n` poses from `from` to `to` (x, y, degrees), bent in the middle by `bend` pixels.
 fn path(n: usize, from: [f64; 3], to: [f64; 3], bend: f64) -> Tsf {
@@ -25,8 +26,8 @@ fn the_blur_of_a_plane_and_its_adjoint_are_the_matrix() {
     let yaw =
         Tsf::new(40.0, vec![Pose { theta_y_deg: 2.0, ..Pose::planar(0.3, -0.8, 1.0, 0.5) }, Pose::planar(-1.2, 0.6, -2.0, 0.5)]).unwrap();
     for tsf in [path(7, [-2.0, 1.0, -3.0], [1.5, -1.2, 4.0], 0.7), yaw] {
-        let taps = TapSet::shifted(&tsf, size.0, size.1, Interpolation::Bilinear);
-        let k = oracle::of_taps(&taps, Interpolation::Bilinear, size, pad);
+        let taps = TapSet::shifted(&tsf, size.0, size.1, Interpolation::Bicubic);
+        let k = oracle::of_taps(&taps, Interpolation::Bicubic, size, pad);
         let operator = Operator::new(&tsf, size.0, size.1, pad);
         let (e, r) = (uniform(1, k.columns, 0.1, 2.0), noise(2, size.0 * size.1));
         // Where K looks beyond the latent grid the matrix sees part of a pixel, the operator none of it; both are masked.
@@ -167,4 +168,124 @@ fn the_joint_estimate_can_be_cancelled() {
         calls < 2
     });
     assert!(found.is_none() && calls == 2);
+}
+
+/// Half-pixel shifts of up to `most` pixels.
+fn planted(seed: u64, count: usize, most: f32) -> Vec<(f64, f64)> {
+    let numbers = uniform(seed, 2 * count, -2.0 * most, 2.0 * most);
+    numbers.chunks(2).map(|s| (f64::from(s[0].round()) / 2.0, f64::from(s[1].round()) / 2.0)).collect()
+}
+
+/// Nine patches over a `size` frame.
+fn nine(size: (usize, usize), side: usize) -> Vec<Patch> {
+    let at = |k: usize, n: usize| k * (n - side) / 2;
+    (0..9).map(|i| Patch { x: at(i % 3, size.0), y: at(i / 3, size.1), size: side, score: 1.0 }).collect()
+}
+
+fn centred(p: &Patch, size: (usize, usize)) -> glam::DVec2 {
+    let c = p.centre();
+    glam::DVec2::new(c.0 - (size.0 as f64 - 1.0) / 2.0, c.1 - (size.1 as f64 - 1.0) / 2.0)
+}
+
+/// What is left of `shifts` once the shift and the small rotation of all that explain most of them are taken off, pixels: neither changes what a
+/// TSF can explain.
+fn left_over(shifts: &[(f64, f64)], places: &[glam::DVec2]) -> f64 {
+    let n = shifts.len() as f64;
+    let mean = shifts.iter().fold(glam::DVec2::ZERO, |s, v| s + glam::DVec2::new(v.0, v.1)) / n;
+    let centre = places.iter().copied().sum::<glam::DVec2>() / n;
+    let apart = || shifts.iter().zip(places).map(|(s, p)| (glam::DVec2::new(s.0, s.1) - mean, *p - centre));
+    let angle = apart().map(|(s, p)| p.perp_dot(s)).sum::<f64>() / apart().map(|(_, p)| p.length_squared()).sum::<f64>();
+    apart().map(|(s, p)| (s - angle * p.perp()).abs().max_element()).fold(0.0, f64::max)
+}
+
+#[test]
+fn psfs_of_a_frame_find_back_from_planted_shifts() {
+    let size = (200, 160);
+    let truth = path(40, [-3.0, 1.0, -0.8], [2.5, -1.5, 0.9], 2.0);
+    let patches = nine(size, 40);
+    let places: Vec<glam::DVec2> = patches.iter().map(|p| centred(p, size)).collect();
+    let shifts = planted(7, 9, 2.0);
+    let psfs: Vec<(Patch, Psf)> =
+        patches.iter().zip(&places).zip(&shifts).map(|((p, at), s)| (*p, tsf::shifted(&tsf::psf_at(&truth, *at, 10), *s))).collect();
+    let found = tsf::align_within(&psfs, &PoseGrid::new(size.0, size.1, 8, 1.5, 1.0), size.0, size.1).unwrap();
+    let whole: Vec<(f64, f64)> = shifts.iter().zip(&found.shifts).map(|(a, b)| (a.0 + b.0, a.1 + b.1)).collect();
+    let (before, after) = (left_over(&shifts, &places), left_over(&whole, &places));
+    assert!(before > 1.2, "the planted shifts are {before:.2} px");
+    assert!(after <= 0.5, "PSFs are left {after:.2} px apart");
+    assert!(found.error < 0.1, "the TSF leaves {:.2} of the PSFs unexplained", found.error);
+}
+
+#[test]
+fn psfs_across_frames_find_back_from_planted_shifts() {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let tsfs = shakes();
+    let frames = frames(&latent, &tsfs);
+    let patches: Vec<Patch> = nine(SIZE, 48).into_iter().filter(|p| p.x != 12 && p.y != 6).collect();
+    let shifts = planted(9, patches.len(), 2.0);
+    let psfs: Vec<(Patch, Psf)> =
+        patches.iter().zip(&shifts).map(|(p, s)| (*p, tsf::shifted(&tsf::psf_at(&tsfs[1], centred(p, SIZE), 8), *s))).collect();
+    let everywhere = Plane::filled(SIZE.0, SIZE.1, 1.0);
+    let found = tsf::align_across(&psfs, &tsfs[0], (&frames[0].blurred, &frames[1].blurred), &everywhere);
+    assert_eq!(found.len(), 4);
+    for (s, f) in shifts.iter().zip(&found) {
+        assert!((s.0 + f.0).abs() <= 0.5 && (s.1 + f.1).abs() <= 0.5, "planted {s:?}, found {f:?}");
+    }
+}
+
+/// Smallest ‖S h - truth‖ / ‖truth‖ over shifts of half pixels.
+fn up_to_shift(h: &Psf, truth: &Psf) -> f64 {
+    let norm = |f: &dyn Fn(usize) -> f32| (0..truth.values.data.len()).map(|i| f64::from(f(i)).powi(2)).sum::<f64>().sqrt();
+    let error = |s: (f64, f64)| {
+        let moved = tsf::shifted(h, s);
+        norm(&|i| moved.values.data[i] - truth.values.data[i]) / norm(&|i| truth.values.data[i])
+    };
+    let steps = || (-8..=8).map(|k| f64::from(k) / 2.0);
+    steps().flat_map(|y| steps().map(move |x| (x, y))).map(error).fold(f64::INFINITY, f64::min)
+}
+
+/// Two frames of 64 x 64 pixels under translations.
+fn pair() -> (Vec<Frame>, [Psf; 2]) {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let moves = [path(9, [-1.5, 0.5, 0.0], [1.5, -0.5, 0.0], 0.8), path(15, [-2.0, -2.5, 0.0], [2.0, 2.0, 0.0], 1.5)];
+    let psfs = moves.each_ref().map(|t| tsf::psf_at(t, glam::DVec2::ZERO, 5));
+    (frames(&latent, &moves), psfs)
+}
+
+#[test]
+fn a_pair_of_patches_tells_both_psfs() {
+    let (frames, truth) = pair();
+    let (cut, weight) = (|p: &Plane| p.crop(6, 0, 60, 60), Plane::filled(60, 60, 1.0));
+    let setup = psf::Setup { radius: 5, ..psf::Setup::default() };
+    let found = psf::estimate_pair(&cut(&frames[0].blurred), &cut(&frames[1].blurred), [&weight, &weight], &setup).unwrap();
+    for (h, t) in found.psfs.iter().zip(&truth) {
+        assert!((h.values.data.iter().sum::<f32>() - 1.0).abs() < 1e-3 && h.values.data.iter().all(|v| *v >= 0.0));
+        let point = Psf { radius: 5, values: Plane::from_fn(11, 11, |x, y| if (x, y) == (5, 5) { 1.0 } else { 0.0 }) };
+        let (error, none) = (up_to_shift(h, t), up_to_shift(&point, t));
+        assert!(error < 0.6 * none, "the PSF is {error:.2} off, a point {none:.2}");
+    }
+}
+
+#[test]
+fn a_pair_without_measurements_tells_nothing() {
+    let (frames, _) = pair();
+    let (cut, dark) = (|p: &Plane| p.crop(6, 0, 60, 60), Plane::filled(60, 60, 0.0));
+    let weight = dark.map(|_| 1.0);
+    let estimate = |a: &Plane, b: &Plane, w: [&Plane; 2], radius: usize| {
+        psf::estimate_pair(a, b, w, &psf::Setup { radius, rounds: 1, ..psf::Setup::default() })
+    };
+    let (a, b) = (cut(&frames[0].blurred), cut(&frames[1].blurred));
+    assert!(estimate(&a, &b, [&weight, &dark], 5).is_none(), "masked");
+    assert!(estimate(&dark, &dark, [&weight, &weight], 5).is_none(), "black");
+    assert!(estimate(&a, &b, [&weight, &weight], 16).is_none(), "smaller than the PSF allows");
+    assert!(estimate(&a, &b, [&weight, &weight], 5).is_some());
+}
+
+#[test]
+fn patches_can_be_cancelled_and_say_which_frame_lacks_texture() {
+    let mut frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
+    let pair = psf::Setup { radius: 4, rounds: 1, ..psf::Setup::default() };
+    let setup = PatchSetup { count: 2, side: 40, pair };
+    assert_eq!(blind::from_patches(&frames, 0, &setup, &mut |_| false).err(), Some(Lack::Cancelled));
+    frames[2].mask = frames[2].mask.map(|_| 0.0);
+    assert_eq!(blind::from_patches(&frames, 0, &setup, &mut |_| true).err(), Some(Lack::Texture(2)));
 }

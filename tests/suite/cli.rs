@@ -133,7 +133,8 @@ fn wrong_options_are_usage_errors() {
         ),
         ("merge -o x.exr --exposures 1,2 --focal-px 0 a.png b.png", 2, &["--focal-px", "positive"]),
         ("merge -o x.exr --exposures 1,2 --patch 12 a.png b.png", 2, &["--patch", "120,80"]),
-        ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint nor off"]),
+        ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint, patches nor off"]),
+        ("merge -o x.exr --exposures 1,2 --blind patches --tsf tsf.json a.png b.png", 2, &["--blind patches", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --blind joint --tsf tsf.json a.png b.png", 2, &["--blind joint", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --alpha 1.5 a.png b.png", 2, &["--alpha", "from 0 to 1"]),
         ("merge -o x.exr --exposures 1,2 --noise 4000 a.png b.png", 2, &["--noise", "\"4000\"", "12000,6"]),
@@ -312,12 +313,18 @@ fn column<'a>(report: &'a Value, field: &str) -> Vec<&'a Value> {
 fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
     let dir = tempdir().unwrap();
     let truth = tiny(dir.path(), [0.0, 0.0, 7.0], 0.4);
-    let (image, factor, report, said) = merge_tiny(dir.path(), "first", &["--preview", "first.png"]);
+    let (image, factor, report, said) = merge_tiny(dir.path(), "first", &["--preview", "first.png", "--report-html", "first.html"]);
     assert!(said.starts_with("wrote first.exr (96 x 72; 1.0 is the white of frame 2, frame2.png, at 0.125 s)"), "{said}");
     assert!(!said.contains("warning"), "{said}");
     assert_eq!(factor, Some(0.125));
     let off = log_difference(&image, &truth.map_planes(|p| p.map(|v| v * 0.125)), 1.0);
     assert!(off < 0.25, "log irradiance is off by {off:.3}");
+    let page = std::fs::read_to_string(dir.path().join("first.html")).unwrap();
+    for part in
+        ["3: frame3.png", "shaken, deblurred", "Local blur (PSF) at each patch", "Camera motion (TSF)", "roll, deg", "residual over noise"]
+    {
+        assert!(page.contains(part), "the page lacks {part}");
+    }
     let preview = image::open(dir.path().join("first.png")).unwrap().into_rgb8();
     assert_eq!(preview.dimensions(), (96, 72));
     let shades = preview.pixels().map(|p| p.0[1]);
@@ -541,6 +548,8 @@ fn wrong_synth_compare_and_baseline_options_are_refused() {
         ("compare --no-reference text.png", 1, &["text.png", "not a picture"]),
         ("compare --no-reference a.png", 1, &["a.png", "64 pixels"]),
         ("experiment fig99 --output-dir other", 2, &["fig99", "fig5", "sharpness"]),
+        ("experiment office --output-dir other", 2, &["office", "--photographs"]),
+        ("experiment office --photographs nowhere --output-dir other", 1, &["nowhere", "--photographs"]),
         ("baseline --output-dir other --method tripod --exposures 1,2 a.png b.png", 2, &["--tripod", "0 tripod frames for 2 frames"]),
         ("baseline --output-dir other --method mertens,mertens --exposures 1,2 a.png b.png", 2, &["--method", "named twice"]),
     ]);

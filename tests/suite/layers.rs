@@ -23,7 +23,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
-    ("blind", &["image", "merge", "pose", "tsf"]),
+    ("blind", &["image", "merge", "pose", "psf", "tsf"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
@@ -55,7 +55,7 @@ const TABLE: &[(&str, &[&str])] = &[
     // Colours.
     ("colour", &["image"]),
     // What a result rests on.
-    ("layers", &["image", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
+    ("layers", &["image", "pose::nearest_pixel", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
@@ -73,10 +73,12 @@ const TABLE: &[(&str, &[&str])] = &[
             "tonemap",
             "synth",
             "pipeline",
-            "psf::Psf",
-            "tsf::Tsf",
-            "tsf::TsfEntry",
-            "tsf::TsfFile",
+            "noise",
+            "mask",
+            "merge::gradient_level",
+            "register::Registrar",
+            "psf",
+            "tsf",
         ],
     ),
     // The edges of the program.
@@ -93,7 +95,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "experiments",
             "colour",
             "layers",
-            "mask",
+            "merge::resampled",
             "io",
             "pipeline",
             "metrics",

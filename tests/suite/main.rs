@@ -18,6 +18,8 @@ mod blind;
 mod cli;
 /// The demo's bracket and its before/after picture.
 mod demo;
+/// The paper's experiments, tiny.
+mod experiments;
 /// Files: frames, exposure times, OpenEXR, outputs.
 mod io;
 /// Every other kernel against its oracle.

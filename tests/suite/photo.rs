@@ -198,13 +198,34 @@ fn png_with(exif: &[u8]) -> Vec<u8> {
     bytes
 }
 
+/// What cannot be read of a frame does not come out of its result as something else: here the first of two exposure times is no number.
+#[test]
+fn a_tag_that_comes_twice_is_carried_as_it_is_read() {
+    let time = |num, denom| exif::Field {
+        tag: exif::Tag::ExposureTime,
+        ifd_num: exif::In::PRIMARY,
+        value: exif::Value::Rational(vec![exif::Rational { num, denom }]),
+    };
+    let (nonsense, other) = (time(0, 0), time(20, 1));
+    let mut writer = exif::experimental::Writer::new();
+    writer.push_field(&nonsense);
+    writer.push_field(&other);
+    let mut block = std::io::Cursor::new(Vec::new());
+    writer.write(&mut block, false).unwrap();
+    let noted = metadata::read_bytes(block.get_ref());
+    let again = metadata::read_bytes(&noted.exif_block().unwrap());
+    assert_eq!(noted.exposure_time, again.exposure_time);
+    let exif = exif::Reader::new().read_raw(noted.exif_block().unwrap()).unwrap();
+    assert_eq!(exif.fields().filter(|f| f.tag == exif::Tag::ExposureTime).count(), 1);
+}
+
 #[test]
 fn dates_are_seconds() {
     let seconds = |t: &str| metadata::seconds(t);
     assert_eq!(seconds("1970:01:01 00:00:00"), Some(0.0));
     assert_eq!(seconds("2024:02:29 12:00:00.25"), Some(1_709_208_000.25));
     assert_eq!(seconds("2024:03:01 12:00:00").unwrap() - seconds("2024:02:29 12:00:00").unwrap(), 86400.0);
-    for wrong in ["", "0000:00:00 00:00:00", "2024:13:01 00:00:00", "yesterday noon", "2024:01:01"] {
+    for wrong in ["", "9223372036854775807:01:01 00:00:00", "0000:00:00 00:00:00", "2024:13:01 00:00:00", "yesterday noon", "2024:01:01"] {
         assert_eq!(seconds(wrong), None, "{wrong}");
     }
 }
@@ -283,6 +304,39 @@ fn linear_files_are_linear_frames() {
     let above = truth.0.iter().flat_map(|p| &p.data).filter(|v| **v > 1.0).count() as f64 / (3.0 * 40.0 * 30.0);
     assert!(above > 0.0 && (clipped - above).abs() < 1e-9);
     assert!(matches!(image::open(at("b.tif")).unwrap(), image::DynamicImage::ImageRgb16(_)));
+}
+
+/// Memory is asked for what a file can hold, not for what its header claims.
+#[test]
+fn headers_that_claim_more_than_their_files_hold_are_refused() {
+    let dir = tempdir().unwrap();
+    let refused = |name: &str, bytes: &[u8]| {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        for error in [input::read(&path, 1.0).err(), input::read_linear(&path).err()] {
+            let text = error.unwrap().to_string();
+            assert!(text.contains(name) && text.contains("claims") && text.contains("cannot hold"), "{text}");
+        }
+    };
+    refused("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 60000 +X 60000\n\x02\x02\xea\x60");
+    // A JPEG that never ends a line costs little: 759 bytes claimed 100 million pixels.
+    photos::write_jpeg(&dir.path().join("whole.jpg"), &image::RgbImage::new(24, 16), &Notes::default());
+    let mut bytes = std::fs::read(dir.path().join("whole.jpg")).unwrap();
+    let at = bytes.windows(2).position(|w| w == [0xFF, 0xC0]).unwrap();
+    bytes[at + 5..at + 9].copy_from_slice(&[0x20, 0, 0x30, 0]);
+    std::fs::write(dir.path().join("a.jpg"), &bytes).unwrap();
+    let text = input::read(&dir.path().join("a.jpg"), 1.0).unwrap_err().to_string();
+    assert!(text.contains("a.jpg") && text.contains("claims 12288 x 8192 pixels"), "{text}");
+    let path = dir.path().join("whole.exr");
+    let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
+    Output::check(&path, true).unwrap().stage_exr(&colours(24, 16), &radiometry).unwrap().commit().unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    for window in [b"dataWindow\0box2i\0\x10\0\0\0".as_slice(), b"displayWindow\0box2i\0\x10\0\0\0"] {
+        let at = bytes.windows(window.len()).position(|w| w == window).unwrap() + window.len();
+        bytes[at + 8..at + 12].copy_from_slice(&59_999i32.to_le_bytes());
+        bytes[at + 12..at + 16].copy_from_slice(&59_999i32.to_le_bytes());
+    }
+    refused("a.exr", &bytes);
 }
 
 #[test]
@@ -454,4 +508,196 @@ fn a_dng_bracket_is_merged_in_true_colours() {
     std::fs::copy(dir.path().join("out.jpg"), dir.path().join("d.jpg")).unwrap();
     let (code, said) = unshaken(dir.path(), &["merge", "-o", "x.exr", "a.dng", "d.jpg"]);
     assert!(code == Some(1) && said.contains("d.jpg") && said.contains("one kind"), "{said}");
+}
+
+/// Frames of sensors whose noise the files note: variance = S x + O, the mean of the colours' pairs.
+#[test]
+fn noise_that_dng_files_note_is_used() {
+    let dir = tempdir().unwrap();
+    let truth = colours(64, 48);
+    let write = |name: &str, time: (u32, u32), noise: Option<Vec<f64>>| {
+        let exposed = truth.map_planes(|p| p.map(|v| v * time.0 as f32 / time.1 as f32));
+        let notes = Notes { time: Some(time), noise, ..Notes::default() };
+        std::fs::write(dir.path().join(name), photos::dng(&exposed, &notes)).unwrap();
+    };
+    let pairs = vec![3e-4, 2e-6, 1e-4, 1e-6, 2e-4, 3e-6];
+    write("a.dng", (1, 2), Some(pairs.clone()));
+    write("b.dng", (2, 1), Some(pairs));
+    let noted = input::read(&dir.path().join("a.dng"), 1.0).unwrap().metadata.noise.unwrap();
+    assert!((noted[0] - 2e-4).abs() < 1e-12 && (noted[1] - 2e-6).abs() < 1e-14, "{noted:?}");
+    let merge = |more: &[&str]| {
+        let line = ["merge", "--overwrite", "--no-align", "--sharp", "1,2", "-o", "x.exr", "--report", "x.json"];
+        let (code, said) = unshaken(dir.path(), &[&line[..], more, &["a.dng", "b.dng"]].concat());
+        assert_eq!(code, Some(0), "{said}");
+        let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("x.json")).unwrap()).unwrap();
+        (report["noise_origin"].as_str().unwrap().to_string(), report["noise"]["shot"].as_f64().unwrap(), said)
+    };
+    let (origin, shot, _) = merge(&[]);
+    assert!(origin == "noted by the files" && (shot - 2e-4).abs() < 1e-12, "{origin}: {shot}");
+    let (_, shot, _) = merge(&["--scale", "0.5"]);
+    assert!((shot - 0.5e-4).abs() < 1e-12, "means of four pixels: {shot}");
+    let (origin, shot, _) = merge(&["--noise", "1000,5"]);
+    assert!(origin == "given" && (shot - 1e-3).abs() < 1e-12, "{origin}: {shot}");
+    // Another speed, another noise: nothing that holds for both.
+    write("b.dng", (2, 1), Some(vec![8e-4, 9e-6]));
+    let (origin, _, said) = merge(&[]);
+    assert!(origin == "estimated from the frames" && said.contains("do not note one noise level"), "{origin}: {said}");
+    for wrong in [vec![], vec![1e-4], vec![-1.0, 0.0], vec![f64::NAN, 0.0], vec![2.0, 0.0]] {
+        write("b.dng", (2, 1), Some(wrong.clone()));
+        assert_eq!(input::read(&dir.path().join("b.dng"), 1.0).unwrap().metadata.noise, None, "{wrong:?}");
+    }
+}
+
+/// A frame that registration places elsewhere is looked up there.
+#[test]
+fn layers_lie_on_the_pixels_of_the_result() {
+    use unshaken::exposure::{Bracket, Frame};
+    let (w, h) = (40, 30);
+    // A lamp at (20, 10) of the scene, which the second frame shows five pixels further right and clips.
+    let frame =
+        |name: &str, time: f64, at: usize| {
+            let plane = Plane::from_fn(w, h, |x, y| {
+                if x.abs_diff(at) < 3 && y.abs_diff(10) < 3 { (2.0 * time as f32).min(1.0) } else { 0.1 * time as f32 }
+            });
+            Frame { name: name.into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time: time }
+        };
+    let bracket = Bracket::new(vec![frame("a", 0.25, 20), frame("b", 1.0, 25)]).unwrap();
+    let shift = glam::DMat3::from_translation(glam::DVec2::new(5.0, 0.0));
+    let outcome = unshaken::pipeline::Outcome {
+        irradiance: bracket.frames()[0].intensity.clone(),
+        reference: 0,
+        left_out: vec![],
+        degraded: vec![],
+        places: vec![glam::DMat3::IDENTITY, shift],
+        masks: vec![Plane::filled(w, h, 1.0); 2],
+        misfit: vec![Some(Plane::filled(w, h, 1.0)), Some(Plane::from_fn(w, h, |x, _| if x == 30 { 9.0 } else { 0.5 }))],
+        report: serde_json::json!({ "noise": { "shot": 1e-4, "read": 1e-6 } }),
+    };
+    let layers: std::collections::BTreeMap<String, Plane> =
+        unshaken::layers::layers(&bracket, &Response::Linear, &outcome).into_iter().collect();
+    assert_eq!(
+        layers.keys().map(String::as_str).collect::<Vec<_>>(),
+        ["confidence.Y", "residual.Y", "saturation.Y", "weight.frame1", "weight.frame2"]
+    );
+    let at = |name: &str, x: usize| layers[name].at(x, 10);
+    assert_eq!((at("saturation.Y", 20), at("saturation.Y", 25)), (0.5, 0.0), "where the lamp is in the result");
+    assert_eq!((at("weight.frame1", 20), at("weight.frame2", 20)), (1.0, 0.0));
+    assert!(at("weight.frame2", 10) > 0.7, "the longer frame counts more: {}", at("weight.frame2", 10));
+    assert_eq!((at("residual.Y", 25), at("residual.Y", 30)), (9.0, 1.0));
+    // The last five columns lie beyond the second frame.
+    assert_eq!((at("weight.frame1", 36), at("saturation.Y", 36)), (1.0, 0.0));
+    assert!(at("confidence.Y", 5) > 0.9 && at("confidence.Y", 5) < 1.0);
+}
+
+/// The parts of a JPEG file: its segments' contents by marker, and where the compressed picture begins.
+fn segments(jpeg: &[u8]) -> Vec<(u8, usize, Vec<u8>)> {
+    assert_eq!(jpeg[..2], [0xFF, 0xD8]);
+    let (mut at, mut all) = (2, Vec::new());
+    while jpeg[at + 1] != 0xDA {
+        let length = usize::from(u16::from_be_bytes([jpeg[at + 2], jpeg[at + 3]]));
+        all.push((jpeg[at + 1], at + 4, jpeg[at + 4..at + 2 + length].to_vec()));
+        at += 2 + length;
+    }
+    all
+}
+
+/// A picture with a gain map: found by both directories, and with it the light that the picture alone does not show.
+#[test]
+fn gain_maps_give_back_the_highlights() {
+    let dir = tempdir().unwrap();
+    let image = {
+        // Two decades, coloured, smooth.
+        let lamp = Plane::from_fn(120, 90, |x, y| 0.5 + 40.0 * (-((x as f32 - 80.0).hypot(y as f32 - 40.0) / 14.0).powi(2)).exp());
+        Rgb([lamp.clone(), lamp.map(|v| 0.8 * v), lamp.map(|v| 0.6 * v)])
+    };
+    let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
+    Output::check(&dir.path().join("a.exr"), true).unwrap().stage_exr(&image, &radiometry).unwrap().commit().unwrap();
+    let (code, said) = unshaken(dir.path(), &["tonemap", "a.exr", "-o", "a.jpg", "--gain-map", "--quality", "97"]);
+    assert_eq!(code, Some(0), "{said}");
+    let file = std::fs::read(dir.path().join("a.jpg")).unwrap();
+    // Every program sees the picture as it is without a map.
+    unshaken(dir.path(), &["tonemap", "a.exr", "-o", "plain.jpg", "--quality", "97"]);
+    let picture = image::open(dir.path().join("a.jpg")).unwrap().into_rgb8();
+    assert_eq!(picture, image::open(dir.path().join("plain.jpg")).unwrap().into_rgb8());
+    // The Multi-Picture directory (big-endian, three entries) and the container agree on the second file.
+    let parts = segments(&file);
+    let (_, at, mpf) = parts.iter().find(|s| s.0 == 0xE2 && s.2.starts_with(b"MPF\0")).unwrap();
+    let number = |i: usize| u32::from_be_bytes(mpf[4 + i..8 + i].try_into().unwrap()) as usize;
+    assert_eq!((&mpf[4..8], number(4), number(50 + 8)), (&b"MM\0*"[..], 8, 0));
+    let (first, second, offset) = (number(50 + 4), number(66 + 4), number(66 + 8));
+    assert_eq!((at + 4 + offset, first + second), (first, file.len()), "the map begins where the picture ends");
+    let map = &file[first..];
+    let xmp = |parts: &[(u8, usize, Vec<u8>)]| {
+        let found = parts.iter().find(|s| s.0 == 0xE1 && s.2.starts_with(b"http://ns.adobe.com/xap/1.0/\0")).unwrap();
+        String::from_utf8(found.2[29..].to_vec()).unwrap()
+    };
+    let container = xmp(&parts);
+    assert!(container.contains(&format!("Item:Length=\"{second}\"")) && container.contains("hdrgm:Version=\"1.0\""), "{container}");
+    let meaning = xmp(&segments(map));
+    let value = |name: &str| -> f64 {
+        let from = meaning.find(&format!("hdrgm:{name}=\"")).unwrap() + name.len() + 8;
+        meaning[from..].split('"').next().unwrap().parse().unwrap()
+    };
+    // The binary block says the same, as fractions.
+    let map_parts = segments(map);
+    let iso = &map_parts.iter().find(|s| s.0 == 0xE2).unwrap().2[28..];
+    let fraction = |i: usize| {
+        let at = |k: usize| i32::from_be_bytes(iso[5 + 8 * i + k..9 + 8 * i + k].try_into().unwrap());
+        f64::from(at(0)) / f64::from(at(4))
+    };
+    assert_eq!((iso.len(), iso[4]), (5 + 7 * 8, 0x40));
+    for (i, name) in ["HDRCapacityMin", "HDRCapacityMax", "GainMapMin", "GainMapMax", "Gamma", "OffsetSDR", "OffsetHDR"].iter().enumerate()
+    {
+        assert!((fraction(i) - value(name)).abs() < 2e-6, "{name}: {} and {}", fraction(i), value(name));
+    }
+    // ISO 21496-1, with all the headroom there is: (picture + offset) 2^gain - offset.
+    let codes = image::load_from_memory(map).unwrap().into_luma8();
+    assert_eq!(codes.dimensions(), (60, 45));
+    let light = |x: u32, y: u32| {
+        let gain =
+            value("GainMapMin") + (value("GainMapMax") - value("GainMapMin")) * f64::from(codes.get_pixel(x / 2, y / 2).0[0]) / 255.0;
+        let base = Response::Srgb.inverse(1, f64::from(picture.get_pixel(x, y).0[1]) / 255.0);
+        (base + value("OffsetSDR")) * gain.exp2() - value("OffsetHDR")
+    };
+    let truth = |x: u32, y: u32| f64::from(image.0[1].at(x as usize, y as usize));
+    let (lamp, dark) = ((80, 40), (66, 30));
+    let shown = light(lamp.0, lamp.1) / light(dark.0, dark.1);
+    let expected = truth(lamp.0, lamp.1) / truth(dark.0, dark.1);
+    assert!(expected > 2.0 && (shown / expected - 1.0).abs() < 0.1, "the lamp over its glow: {shown:.2}, truly {expected:.2}");
+    assert!(light(lamp.0, lamp.1) > 3.0, "stops above white");
+    for wrong in [["tonemap", "a.exr", "-o", "a.png", "--gain-map"].as_slice(), &["merge", "-o", "x.exr", "--gain-map", "a.exr", "b.exr"]] {
+        let (code, said) = unshaken(dir.path(), wrong);
+        assert!(code == Some(2) && said.contains("--gain-map"), "{said}");
+    }
+}
+
+/// Camera JPEGs, turned by the camera, that differ by aperture and speed alone.
+#[test]
+fn a_bracket_by_aperture_and_speed_is_merged_upright() {
+    let dir = tempdir().unwrap();
+    let scene = scene(80, 60, 1.5);
+    for (name, stop, iso, light) in [("a.jpg", (80, 10), 100, 0.125f64), ("b.jpg", (40, 10), 100, 0.5), ("c.jpg", (40, 10), 400, 2.0)] {
+        let picture = image::RgbImage::from_fn(80, 60, |x, y| {
+            let e = f64::from(scene.at(x as usize, y as usize)) * light;
+            image::Rgb([(e.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8; 3])
+        });
+        let notes = Notes { time: Some((1, 8)), f_number: Some(stop), iso: Some(iso), orientation: 6, ..Notes::default() };
+        photos::write_jpeg(&dir.path().join(name), &picture, &notes);
+    }
+    let line = "merge --no-align --sharp 1,2,3 --response gamma:2.2 -o x.exr --report x.json --strict a.jpg b.jpg c.jpg";
+    let (code, said) = unshaken(dir.path(), &line.split(' ').collect::<Vec<_>>());
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("differ in aperture (8, 4, 4)") && said.contains("ISO speed (100, 100, 400)"), "{said}");
+    let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("x.json")).unwrap()).unwrap();
+    let times: Vec<f64> = (0..3).map(|i| report["frames"][i]["exposure_time_s"].as_f64().unwrap()).collect();
+    assert!((times[1] / times[0] - 4.0).abs() < 1e-6 && (times[2] / times[0] - 16.0).abs() < 1e-6, "{times:?}");
+    let file = exr::read_file(&dir.path().join("x.exr")).unwrap();
+    assert_eq!(file.image.size(), (60, 80), "upright");
+    // The picture's left column was its bottom row; its scale is the reference frame's.
+    let at = |x: usize, y: usize| f64::from(file.image.0[1].at(x, y));
+    let truth = |x: usize, y: usize| f64::from(scene.at(y, 59 - x));
+    for (x, y) in [(10, 20), (50, 70), (30, 40)] {
+        let ratio = at(x, y) / truth(x, y) / (at(5, 5) / truth(5, 5));
+        assert!((ratio - 1.0).abs() < 0.06, "({x}, {y}): {ratio}");
+    }
 }

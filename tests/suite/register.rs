@@ -194,3 +194,24 @@ fn a_tsf_is_found_about_the_motion_of_its_frame() {
     let m = refined.mean();
     assert!((m.t_x - 1.2).abs() < 0.1 && (m.t_y - 0.4).abs() < 0.1 && m.theta_z_deg.abs() < 0.05, "{m:?}");
 }
+
+#[test]
+fn a_displaced_frame_shows_what_lies_around_the_reference() {
+    let (w, h, pad) = (11, 8, 5);
+    // A ramp of the reference's coordinates, seen by a frame that looks 3 px to the right and 2 px up.
+    let ramp = |x: f64, y: f64| (0.3 * x + 0.7 * y + 9.0) as f32;
+    let seen = Plane::from_fn(w, h, |x, y| ramp(x as f64 + 3.0, y as f64 - 2.0));
+    let image = Rgb([seen.clone(), seen.clone(), seen]);
+    let motion = DMat3::from_translation(DVec2::new(-3.0, 2.0));
+    let (out, inside) = unshaken::merge::resampled(&image, &Plane::filled(w, h, 1.0), &motion, pad);
+    assert_eq!(out.size(), (w + 2 * pad, h + 2 * pad));
+    for y in 0..h + 2 * pad {
+        for x in 0..w + 2 * pad {
+            let (u, v) = (x as f64 - pad as f64, y as f64 - pad as f64);
+            let shown = (0.0..w as f64).contains(&(u - 3.0)) && (0.0..h as f64).contains(&(v + 2.0));
+            let p = y * out.size().0 + x;
+            assert_eq!(inside.data[p], if shown { 1.0 } else { 0.0 }, "({x}, {y})");
+            assert!(!shown || (out.0[1].data[p] - ramp(u, v)).abs() < 1e-4, "({x}, {y}): {} for {}", out.0[1].data[p], ramp(u, v));
+        }
+    }
+}

@@ -49,6 +49,32 @@ fn the_noise_level_is_found_within_a_fifth() {
 }
 
 #[test]
+fn texture_that_two_frames_share_is_no_noise() {
+    // Texture everywhere, which no frame alone tells from noise.
+    let truth = noise::NoiseModel::from_electrons(4000.0, 8.0);
+    let (w, h) = (256, 192);
+    let grain = numbers(7, w * h);
+    let frame = |exposure_time: f64, seed: u64| {
+        let n: Vec<f32> =
+            (0..12).map(|k| numbers(seed + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
+        let plane = Plane::from_fn(w, h, |x, y| {
+            let level = 0.02 + 0.5 * ((x / 16) as f64 / 16.0).powi(2);
+            let e = exposure_time * level * (1.0 + 0.3 * f64::from(grain[y * w + x]));
+            let z = e + truth.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0;
+            (z.clamp(0.0, 1.0) * 65535.0).round() as f32 / 65535.0
+        });
+        Frame { name: "grain".into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time }
+    };
+    let frames = [frame(1.0, 300), frame(0.4, 400)];
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+    let found = noise::estimate(&frames, &exposures, &Response::Linear);
+    for x in [0.02, 0.1, 0.3] {
+        let ratio = found.variance(x) / truth.variance(x);
+        assert!((0.8..1.2).contains(&ratio), "variance at {x} is {ratio:.2} times the truth");
+    }
+}
+
+#[test]
 fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     for (z, expected) in [(0.0, 0.0), (0.075, 0.5), (0.15, 1.0), (0.5, 1.0), (0.85, 1.0), (0.925, 0.5), (1.0, 0.0)] {
         assert!((mask::tukey(z, 0.3) - expected).abs() < 1e-5, "Tukey window at {z}: {}", mask::tukey(z, 0.3));

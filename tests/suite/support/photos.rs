@@ -14,11 +14,22 @@ pub struct Notes {
     pub taken: Option<&'static str>,
     pub orientation: u16,
     pub artist: Option<&'static str>,
+    /// NoiseProfile of a DNG file: pairs S, O.
+    pub noise: Option<Vec<f64>>,
 }
 
 impl Default for Notes {
     fn default() -> Self {
-        Self { time: Some((1, 8)), f_number: Some((56, 10)), iso: Some(200), bias: None, taken: None, orientation: 1, artist: None }
+        Self {
+            time: Some((1, 8)),
+            f_number: Some((56, 10)),
+            iso: Some(200),
+            bias: None,
+            taken: None,
+            orientation: 1,
+            artist: None,
+            noise: None,
+        }
     }
 }
 
@@ -126,10 +137,11 @@ pub fn dng(scene: &Rgb, notes: &Notes) -> Vec<u8> {
         (50728, ratios(5, &ten_thousandths(&NEUTRAL))),
         (50778, short(&[21])),
     ];
-    if let Some(artist) = notes.artist {
-        main.push((315, text(artist)));
-        main.sort_by_key(|t| t.0);
-    }
+    main.extend(notes.artist.map(|a| (315, text(a))));
+    main.extend(
+        notes.noise.as_ref().map(|v| (51041, (12u16, v.len() as u32, v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()))),
+    );
+    main.sort_by_key(|t| t.0);
     type Entry = (u16, (u16, u32, Vec<u8>));
     let directory = |entries: &[Entry], at: u32| {
         let (mut table, mut more) = ((entries.len() as u16).to_le_bytes().to_vec(), Vec::new());

@@ -1,0 +1,43 @@
+//! The paper's experiments at a size at which nothing can be concluded: that each method stands in the table and the picture shows something.
+
+use unshaken::experiments::{Experiment, Lab};
+
+/// The figure in the column `column` (0-based) of the row that begins with `name`.
+#[track_caller]
+fn figure(table: &str, name: &str, column: usize) -> f64 {
+    let row = table.lines().find(|l| l.starts_with(&format!("| {name} |"))).unwrap_or_else(|| panic!("no row {name:?} in\n{table}"));
+    row.split('|').nth(column + 1).and_then(|c| c.trim().parse().ok()).unwrap_or_else(|| panic!("no figure in {row}"))
+}
+
+#[test]
+fn every_experiment_has_a_name_of_its_own() {
+    let mut names: Vec<_> = Experiment::ALL.iter().map(|e| e.name()).collect();
+    for (e, name) in Experiment::ALL.iter().zip(&names) {
+        assert_eq!(Experiment::named(name).unwrap(), *e);
+    }
+    names.sort_unstable();
+    names.dedup();
+    assert_eq!(names.len(), Experiment::ALL.len());
+    assert!(Experiment::named("fig2").err().unwrap().to_string().contains("fig10"));
+}
+
+#[test]
+fn photographs_are_asked_for() {
+    let said = Lab::new(96, 1, None).run(Experiment::Office, &mut |_| true).err().unwrap().to_string();
+    assert!(said.contains("folder"), "{said}");
+}
+
+#[test]
+fn figure_5_compares_all_methods() {
+    let mut lab = Lab::new(96, 1, None);
+    let report = lab.run(Experiment::Blurred, &mut |_| true).unwrap();
+    let psnr = |name: &str| figure(&report.table, name, 1);
+    let merged = psnr("all frames merged");
+    assert!(psnr("unshaken") > merged + 1.0 && psnr("tripod merged") > psnr("unshaken"), "{}", report.table);
+    for name in ["sharp frames merged", "sharp frames, denoised", "each deblurred, merged", "uniform blur only"] {
+        assert!(psnr(name) > 5.0 && psnr(name) < psnr("tripod merged"), "{name}\n{}", report.table);
+    }
+    let bright = report.picture.pixels().filter(|p| p.0.iter().all(|v| *v > 60)).count();
+    assert!(bright * 20 > report.picture.pixels().len(), "the picture is dark");
+    assert!(lab.run(Experiment::Psfs, &mut |_| true).unwrap().table.lines().count() > 6, "local PSFs of both frames");
+}
