@@ -40,12 +40,12 @@ pub struct Layout {
 
 impl Layout {
     /// Where a point of the frame (pixels, the first centre at 0.5) is on the screen.
-    pub fn to_screen(&self, p: Vec2) -> Pos2 {
+    pub fn to_screen(self, p: Vec2) -> Pos2 {
         self.rect.min + (p - self.pan) * self.zoom
     }
 
     /// The point of the frame at `p`.
-    pub fn to_frame(&self, p: Pos2) -> Vec2 {
+    pub fn to_frame(self, p: Pos2) -> Vec2 {
         self.pan + (p - self.rect.min) / self.zoom
     }
 }
