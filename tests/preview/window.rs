@@ -252,9 +252,13 @@ fn what_cannot_be_read_is_said_in_the_window() {
     std::fs::write(&bad, b"not a picture").unwrap();
     files.push(bad);
     let mut window = Window::open(&files);
-    window.wait("the message", 60, |app| app.texts().iter().any(|t| t.contains("broken.png")));
+    window.wait("the message", 60, |app| !app.is_busy() && app.texts().iter().any(|t| t.contains("broken.png")));
     window.picture();
-    click(&mut window, "Dismiss");
+    // The note on the response may stand there as well.
+    let said = window.app().texts().len();
+    window.harness.get_all_by_label("Dismiss").next().expect("a message can be dismissed").click();
+    window.harness.run_steps(3);
+    assert_eq!(window.app().texts().len(), said - 1, "{:?}", window.app().texts());
     // A session file that is none.
     let other = folder.path().join("s.json");
     std::fs::write(&other, "{}").unwrap();
