@@ -17,6 +17,7 @@ use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -670,17 +671,28 @@ impl Run<'_> {
         Ok(solved)
     }
 
+    /// Exposures and masks of the frames `ids` as registration places them, on the reference's grid plus `pad` pixels on every side; of
+    /// the others as they are. Nothing is copied where nothing moves.
+    fn placed<'m>(&'m self, ids: &[usize], masks: &'m [Plane], pad: usize) -> (Cow<'m, [Rgb]>, Cow<'m, [Plane]>) {
+        let moves = |i: usize| pad > 0 || self.motions[i] != DMat3::IDENTITY;
+        if !ids.iter().any(|&i| moves(i)) {
+            return (Cow::Borrowed(&self.exposures), Cow::Borrowed(masks));
+        }
+        let placed = (0..masks.len()).map(|i| {
+            if ids.contains(&i) && moves(i) {
+                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], pad)
+            } else {
+                (self.exposures[i].clone(), masks[i].clone())
+            }
+        });
+        let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = placed.unzip();
+        (Cow::Owned(exposures), Cow::Owned(masks))
+    }
+
     /// Merge of the frames `ids`, placed but not deblurred, on the reference's grid plus `pad` pixels on every side, and where any of
     /// them is not masked.
     fn start(&self, ids: &[usize], pad: usize) -> (Rgb, Plane) {
-        let seen = (0..self.exposures.len()).map(|i| {
-            if ids.contains(&i) && (pad > 0 || self.motions[i] != DMat3::IDENTITY) {
-                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i], pad)
-            } else {
-                (self.exposures[i].clone(), self.masks[i].clone())
-            }
-        });
-        let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = seen.unzip();
+        let (exposures, masks) = self.placed(ids, &self.masks, pad);
         let merged = merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids);
         let (w, h) = merged.size();
         (merged, Plane::from_fn(w, h, |x, y| ids.iter().map(|&i| masks[i].data[y * w + x]).fold(0.0, f32::max)))

@@ -249,9 +249,10 @@ impl Level {
     }
 }
 
-/// Sum of the logarithms: no frame buys its fit with another's.
-fn loss(chi: &[f64]) -> f64 {
-    chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).sum()
+/// exp of the mean logarithm: no frame buys its fit with another's.
+pub fn geometric_mean(chi: &[f64]) -> f64 {
+    let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
+    if logs.is_empty() { f64::INFINITY } else { (logs.iter().sum::<f64>() / logs.len() as f64).exp() }
 }
 
 /// Value at part `t` of the way from `range.0` to `range.1`, geometrically.
@@ -290,7 +291,7 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
                 return None;
             }
         }
-        let value = loss(&level.judge(&state));
+        let value = geometric_mean(&level.judge(&state));
         if best.as_ref().is_none_or(|b| value < b.0) {
             best = Some((value, state));
         }

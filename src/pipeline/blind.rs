@@ -10,7 +10,6 @@ use crate::merge;
 use crate::psf::{Patch, Psf};
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
-use glam::DMat3;
 use serde_json::{Value, json};
 
 /// What is done when no frame is sharp.
@@ -55,32 +54,14 @@ pub(super) fn doubtful(verdicts: &[Verdict], sharp: &[bool]) -> bool {
     steepest.is_finite() && steepest < SURELY_STEEP
 }
 
-/// exp of the mean logarithm: no frame buys its fit with another's.
-fn geometric_mean(chi: &[f64]) -> f64 {
-    let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
-    if logs.is_empty() { f64::INFINITY } else { (logs.iter().sum::<f64>() / logs.len() as f64).exp() }
-}
-
 impl Run<'_> {
     fn luminances(&self, used: &[usize]) -> (Vec<Frame>, Rgb) {
         let frames = self.bracket.frames();
         let masks = mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions);
-        let (aligned, seen) = self.aligned(used, &masks);
+        let (aligned, seen) = self.placed(used, &masks, 0);
         let merged = merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used);
         let frame = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], frames[i].exposure_time);
         (used.iter().map(frame).collect(), merged)
-    }
-
-    /// Exposures and masks of the frames `used` as registration places them.
-    fn aligned(&self, used: &[usize], masks: &[Plane]) -> (Vec<Rgb>, Vec<Plane>) {
-        let seen = (0..masks.len()).map(|i| {
-            if used.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], 0)
-            } else {
-                (self.exposures[i].clone(), masks[i].clone())
-            }
-        });
-        seen.unzip()
     }
 
     /// `luminance` in the colours of `merged`: those of a blurred merge, but they change less across an edge than the luminance does.
@@ -180,7 +161,7 @@ impl Run<'_> {
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
-        let (joint, alone) = (geometric_mean(&found.held_out), geometric_mean(&found.held_out_merge));
+        let (joint, alone) = (blind::geometric_mean(&found.held_out), blind::geometric_mean(&found.held_out_merge));
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
