@@ -82,17 +82,18 @@ pub fn raise_to_lower_bound(irradiance: &mut Rgb, bracket: &Bracket, exposures: 
     }
 }
 
-/// Mean squared difference over noise variance of a frame's exposure from what `irradiance`, unblurred, predicts, where it is not masked.
-pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64) -> f64 {
-    let (mut sum, mut count) = (0.0f64, 0.0f64);
-    for (c, curve) in curves.iter().enumerate() {
-        for (p, e) in irradiance.0[c].data.iter().enumerate().filter(|(p, _)| mask.data[*p] > 0.0) {
-            let expected = e * exposure_time as f32;
-            sum += f64::from((exposure.0[c].data[p] - expected) / noise_at(curve, expected)).powi(2);
-            count += 1.0;
-        }
-    }
-    if count > 0.0 { sum / count } else { 0.0 }
+/// Squared difference over noise variance of a frame's exposure from what `irradiance`, unblurred, predicts, the mean of the channels at each
+/// pixel; NaN where it is masked.
+pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64) -> Plane {
+    let (w, h) = mask.size();
+    let one = |c: usize, p: usize| {
+        let expected = irradiance.0[c].data[p] * exposure_time as f32;
+        ((exposure.0[c].data[p] - expected) / noise_at(&curves[c], expected)).powi(2)
+    };
+    Plane::from_fn(w, h, |x, y| {
+        let p = y * w + x;
+        if mask.data[p] > 0.0 { (one(0, p) + one(1, p) + one(2, p)) / 3.0 } else { f32::NAN }
+    })
 }
 
 /// Noise of the exposure `x` from its curve: the sample below.

@@ -150,9 +150,13 @@ pub struct Outcome {
 const LARGEST_PAD: f64 = 0.15;
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
-/// Mean squared residual over noise variance up to which a blurred frame is believed whatever else holds: true TSFs reach 1 to 2 on noisy
+/// Squared residual over noise variance up to which a blurred frame is believed whatever else holds: true TSFs reach 1 to 2 on noisy
 /// frames, more on clean ones, where the interpolation's own error shows.
 const HOPELESS: f64 = 8.0;
+/// Squares along the longer side over which that is judged, their least side in pixels, and how many have to speak.
+const SQUARES: usize = 48;
+const LEAST_SQUARE: usize = 8;
+const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
 /// Outer iterations for the sharp frames alone.
@@ -587,8 +591,8 @@ impl Run<'_> {
                     tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
-            let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
-            let pad = deblur::pad_for(&known, w, h, limit);
+            let moving: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
+            let pad = deblur::pad_for(&moving, w, h, limit);
             let from = match solution.as_ref().or(base.as_ref()) {
                 Some(found) => self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken),
                 None => self.surrounded(&latent, 0, pad, &still, &shaken),
@@ -604,14 +608,9 @@ impl Run<'_> {
             let now = format!("{round} {shaken:?}");
             let solved =
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
-            let chi = |i: usize| all.iter().position(|&k| k == i).map_or(f64::NAN, |p| solved.report.chi_squared[p]);
-            // TSFs that the user gave are believed.
-            let hopeless: Vec<(usize, f64)> = estimated
-                .iter()
-                .filter(|i| shaken.contains(i))
-                .map(|&i| (i, chi(i)))
-                .filter(|&(i, c)| c > HOPELESS && c > UNEXPLAINED * self.unblurred(i, &start))
-                .collect();
+            let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
+            let judge = |&i: &usize| Some((i, self.unexplained(i, misfit(i)?, &start)?));
+            let hopeless: Vec<(usize, f64)> = shaken.iter().filter_map(judge).collect();
             if hopeless.is_empty() {
                 latent = solved.cropped();
                 solution = Some(solved);
@@ -620,7 +619,8 @@ impl Run<'_> {
             }
             // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
             for (i, chi) in hopeless {
-                self.leave_out(i, &format!("no camera shake explains it (its residual is {chi:.1} times its noise)"))?;
+                let what = if known[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
+                self.leave_out(i, &format!("{what} (its residual is {chi:.1} times its noise)"))?;
                 shaken.retain(|&k| k != i);
                 all.retain(|&k| k != i);
             }
@@ -724,8 +724,44 @@ impl Run<'_> {
         }))
     }
 
-    /// Mean squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred.
-    fn unblurred(&self, i: usize, latent: &Rgb) -> f64 {
+    /// Whether the blur of frame `i` fails to explain it: `misfit` is the local χ² with it, `start` the irradiance before the frame counted.
+    /// Judged over squares of the frame in which one or the other is far above the noise, by the one in the middle: what moved, or a lamp
+    /// that blur spreads beyond white, is a part of the frame and not its shake. The χ² of that one, where it fails.
+    fn unexplained(&self, i: usize, misfit: &Plane, start: &Rgb) -> Option<f64> {
+        let without = self.unblurred(i, start);
+        let (w, h) = misfit.size();
+        let side = (w.max(h) / SQUARES).max(LEAST_SQUARE);
+        let mut squares: Vec<(f64, f64)> = Vec::new();
+        for y in (0..h).step_by(side) {
+            for x in (0..w).step_by(side) {
+                let (mut with_blur, mut unblurred, mut count) = (0.0, 0.0, 0);
+                for p in (y..(y + side).min(h)).flat_map(|y| (x..(x + side).min(w)).map(move |x| y * w + x)) {
+                    if without.data[p].is_finite() {
+                        with_blur += f64::from(misfit.data[p]);
+                        unblurred += f64::from(without.data[p]);
+                        count += 1;
+                    }
+                }
+                let (c, u) = (with_blur / f64::from(count), unblurred / f64::from(count));
+                if count as usize >= side * side / 4 && c.max(u) > HOPELESS {
+                    squares.push((c, c / u));
+                }
+            }
+        }
+        if squares.len() < FEWEST_SQUARES {
+            return None;
+        }
+        let middle = |mut v: Vec<f64>| {
+            v.sort_by(f64::total_cmp);
+            v[v.len() / 2]
+        };
+        let chi = middle(squares.iter().map(|s| s.0).collect());
+        let left = middle(squares.iter().map(|s| s.1).collect());
+        (chi > HOPELESS && left > UNEXPLAINED).then_some(chi)
+    }
+
+    /// Squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred; NaN where it is masked.
+    fn unblurred(&self, i: usize, latent: &Rgb) -> Plane {
         let (exposure, mask) = (&self.exposures[i], &self.masks[i]);
         let (seen, inside) = if self.motions[i] == DMat3::IDENTITY {
             (latent.clone(), mask.clone())

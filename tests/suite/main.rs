@@ -20,6 +20,7 @@ mod cli;
 mod demo;
 /// The paper's experiments, tiny.
 mod experiments;
+mod faults;
 /// Files: frames, exposure times, OpenEXR, outputs.
 mod io;
 /// Every other kernel against its oracle.

@@ -1,0 +1,147 @@
+//! What must not spoil a merge: a wrong TSF, another scene, something that moved, noise of any level, light beyond white.
+
+use std::sync::OnceLock;
+use unshaken::exposure::{Bracket, Frame};
+use unshaken::image::{Plane, Rgb};
+use unshaken::metrics::{self, Judge};
+use unshaken::noise::NoiseModel;
+use unshaken::pipeline::{self, Outcome, Settings};
+use unshaken::pose::Pose;
+use unshaken::response::Response;
+use unshaken::synth::{self, Camera, SyntheticBracket, Tremor};
+use unshaken::tsf::{TsfEntry, TsfFile};
+
+const SIZE: (usize, usize) = (160, 120);
+
+/// Two sharp frames and a shaken one that holds most of the light.
+fn bracket(full_well: f64, median: f64) -> SyntheticBracket {
+    let scene = synth::room(SIZE.0, SIZE.1, 24, 5);
+    let tremor = Tremor { extent_px: 8.0, roll_deg: 0.8, offset_px: 0.5, offset_deg: 0.0 };
+    let camera = Camera { full_well, ..Camera::default() };
+    synth::capture(&scene, &camera, &[(1.0 / 30.0, None), (1.0 / 8.0, None), (1.0, Some(tremor))], median, 5).unwrap()
+}
+
+/// The TSFs of `made`, that of the shaken frame changed by `change`.
+fn tsfs(made: &SyntheticBracket, change: impl Fn(&Pose) -> Pose) -> TsfFile {
+    let entries = made.bracket.frames().iter().zip(&made.tsfs).enumerate().map(|(i, (f, t))| {
+        let mut t = t.clone();
+        if i == 2 {
+            t.poses = t.poses.iter().map(&change).collect();
+        }
+        TsfEntry::new(&f.name, SIZE.0, SIZE.1, &t)
+    });
+    TsfFile::new(entries.collect())
+}
+
+fn with_frame(made: &SyntheticBracket, change: impl Fn(usize, &Plane) -> Plane) -> Bracket {
+    let mut frames: Vec<Frame> = made.bracket.frames().to_vec();
+    frames[2].intensity = Rgb(std::array::from_fn(|c| change(c, &frames[2].intensity.0[c])));
+    Bracket::new(frames).unwrap()
+}
+
+fn settings() -> Settings {
+    Settings { noise: Some(NoiseModel::from_electrons(4000.0, 8.0)), ..Settings::default() }
+}
+
+fn merge(bracket: &Bracket, settings: &Settings, given: Option<&TsfFile>) -> Outcome {
+    pipeline::merge(bracket, &Response::Srgb, settings, given, &mut |_| true).unwrap()
+}
+
+/// PU21-PSNR of `found`, whose 1 is white after `time` seconds.
+fn decibels(found: &Outcome, bracket: &Bracket, truth: &Rgb) -> f64 {
+    let time = bracket.frames()[found.reference].exposure_time as f32;
+    let limit = Some(0.98 / bracket.frames()[0].exposure_time as f32);
+    let irradiance = found.irradiance.map_planes(|p| p.map(|v| v / time));
+    metrics::score(&irradiance, truth, &Judge { limit, ..Judge::default() }).unwrap().pu_psnr
+}
+
+/// The bracket, and what is reached without its shaken frame and with it.
+fn sound() -> &'static (SyntheticBracket, f64, f64) {
+    static SOUND: OnceLock<(SyntheticBracket, f64, f64)> = OnceLock::new();
+    SOUND.get_or_init(|| {
+        let made = bracket(4000.0, 0.15);
+        let without = merge(&made.bracket, &Settings { exclude: vec![2], ..settings() }, None);
+        let with = merge(&made.bracket, &settings(), Some(&tsfs(&made, |p| *p)));
+        let (without, with) = (decibels(&without, &made.bracket, &made.truth), decibels(&with, &made.bracket, &made.truth));
+        assert!(with > without + 1.0, "the shaken frame brings something: {without:.2} to {with:.2} dB");
+        (made, without, with)
+    })
+}
+
+#[test]
+fn a_tsf_turned_by_half_a_degree_does_no_harm() {
+    let (made, without, _) = sound();
+    let turned = tsfs(made, |p| Pose { theta_z_deg: p.theta_z_deg + 0.5, ..*p });
+    let got = decibels(&merge(&made.bracket, &settings(), Some(&turned)), &made.bracket, &made.truth);
+    assert!(got > without - 0.3, "{got:.2} dB, without the frame {without:.2}");
+}
+
+#[test]
+fn a_frame_of_another_scene_does_no_harm() {
+    let (made, without, _) = sound();
+    // The same frame upside down: as bright, as sharp, and nothing in common.
+    let other = with_frame(made, |_, p| Plane::from_fn(p.width, p.height, |x, y| p.at(p.width - 1 - x, p.height - 1 - y)));
+    for given in [Some(tsfs(made, |p| *p)), None] {
+        let found = merge(&other, &settings(), given.as_ref());
+        let got = decibels(&found, &other, &made.truth);
+        assert!(got > without - 0.3, "TSF given: {}: {got:.2} dB, without the frame {without:.2}", given.is_some());
+        assert!(found.left_out.iter().any(|l| l.0 == "frame3.png"), "{:?}", found.left_out);
+    }
+}
+
+#[test]
+fn what_moved_in_the_shaken_frame_does_no_harm() {
+    let (made, without, with) = sound();
+    // A dark thing of 24 pixels stands where the room was.
+    let thing = |x: usize, y: usize| (60..84).contains(&x) && (50..74).contains(&y);
+    let moved =
+        with_frame(made, |c, p| Plane::from_fn(p.width, p.height, |x, y| if thing(x, y) { 0.2 + 0.1 * c as f32 } else { p.at(x, y) }));
+    let got = decibels(&merge(&moved, &settings(), Some(&tsfs(made, |p| *p))), &moved, &made.truth);
+    assert!(got > without.max(with - 1.0) - 0.3, "{got:.2} dB, sound {with:.2}, without the frame {without:.2}");
+}
+
+#[test]
+fn one_smoothing_serves_dim_frames_and_clean_ones() {
+    for full_well in [1000.0, 5000.0, 25_000.0] {
+        let made = bracket(full_well, 1.0);
+        let noise = Some(NoiseModel::from_electrons(full_well, 8.0));
+        let reached = |factor: f32| {
+            let mut set = Settings { noise, ..settings() };
+            set.deblur.lambda *= factor;
+            decibels(&merge(&made.bracket, &set, Some(&tsfs(&made, |p| *p))), &made.bracket, &made.truth)
+        };
+        let (less, usual, more) = (reached(0.4), reached(1.0), reached(2.5));
+        assert!(usual > less.max(more) - 0.3, "{full_well} electrons: {less:.2}, {usual:.2} by default, {more:.2} dB");
+    }
+}
+
+#[test]
+fn light_beyond_white_goes_on_smoothly() {
+    let made = bracket(4000.0, 12.0);
+    let found = merge(&made.bracket, &settings(), Some(&tsfs(&made, |p| *p)));
+    let (shortest, time) = (&made.bracket.frames()[0], made.bracket.frames()[found.reference].exposure_time as f32);
+    let white = time / shortest.exposure_time as f32;
+    let lost = |x: usize, y: usize| shortest.intensity.0.iter().all(|p| p.at(x, y) >= 1.0);
+    let mut count = 0;
+    for y in 0..SIZE.1 {
+        for x in 0..SIZE.0 {
+            let v = found.irradiance.pixel(y * SIZE.0 + x);
+            assert!(v.iter().all(|v| v.is_finite() && *v >= 0.0));
+            if lost(x, y) {
+                count += 1;
+                assert!(v.iter().all(|v| *v >= 0.97 * white), "({x}, {y}): {v:?} is below what clips, {white}");
+            }
+            // Well inside: no steps of brightness, no colour that nobody saw.
+            let inside = x > 0 && y > 0 && x + 1 < SIZE.0 && y + 1 < SIZE.1 && (0..9).all(|k| lost(x + k % 3 - 1, y + k / 3 - 1));
+            if inside {
+                let next = found.irradiance.pixel(y * SIZE.0 + x + 1);
+                for c in 0..3 {
+                    assert!((v[c] / next[c]).ln().abs() < 0.7, "a step at ({x}, {y}), {v:?} to {next:?}");
+                }
+                let (lo, hi) = v.iter().fold((f32::MAX, 0.0f32), |(lo, hi), v| (lo.min(*v), hi.max(*v)));
+                assert!(hi < 3.0 * lo, "a coloured hole at ({x}, {y}): {v:?}");
+            }
+        }
+    }
+    assert!(count > 50, "the scene holds light beyond white: {count} pixels");
+}
