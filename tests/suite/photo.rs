@@ -111,6 +111,49 @@ fn raw_files_that_cannot_be_developed_are_refused() {
     }
 }
 
+/// Directories that lead to themselves, or are named again and again: rawler would follow them until there is no memory.
+#[test]
+fn raw_files_whose_directories_have_no_end_are_refused() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    let whole = photos::dng(&colours(64, 48), &Notes::default());
+    let refused = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let text = input::read(&path, 1.0).unwrap_err().to_string();
+        assert!(text.contains("a.dng") && text.contains("directory that cannot be") && text.contains("copy it again"), "{text}");
+    };
+    // The next directory is this one.
+    let entries = usize::from(u16::from_le_bytes([whole[8], whole[9]]));
+    let next = 10 + 12 * entries;
+    assert_eq!(whole[next..next + 4], [0; 4]);
+    let mut circle = whole.clone();
+    circle[next] = 8;
+    refused(&circle);
+    // The same, seen only by who reads on where a value is missing: a last entry whose place cannot be.
+    let mut odd = circle.clone();
+    odd[next - 8..next].copy_from_slice(&[5, 0, 0, 0, 255, 255, 255, 255]);
+    refused(&odd);
+    // A hundred thousand directories below it, all one and the same.
+    let mut many = whole.clone();
+    let exif = (0..entries).map(|i| 10 + 12 * i).find(|at| whole[*at..*at + 2] == 34665u16.to_le_bytes()).unwrap();
+    let (place, below) = (many.len() as u32, whole[exif + 8..exif + 12].to_vec());
+    many[exif + 4..exif + 8].copy_from_slice(&100_000u32.to_le_bytes());
+    many[exif + 8..exif + 12].copy_from_slice(&place.to_le_bytes());
+    many.extend(below.repeat(100_000));
+    refused(&many);
+    // The notes of a CR3 file are such files within boxes.
+    let sized = |name: &[u8], content: &[u8]| [&(content.len() as u32 + 8).to_be_bytes()[..], name, content].concat();
+    let id = [0x85, 0xc0, 0xb6, 0x87, 0x82, 0x0f, 0x11, 0xe0, 0x81, 0x11, 0xf4, 0xce, 0x46, 0x2b, 0x6a, 0x48];
+    let cr3 = |notes: &[u8]| {
+        let canon = sized(b"uuid", &[&id[..], notes].concat());
+        [sized(b"ftyp", b"crx \0\0\0\x01crx isom"), sized(b"moov", &canon)].concat()
+    };
+    refused(&cr3(&sized(b"CMT1", &circle)));
+    let mut long = sized(b"CMT1", &whole);
+    long[..4].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff]);
+    refused(&cr3(&long));
+}
+
 #[test]
 fn a_real_dng_decodes_and_its_missing_times_are_refused() {
     let Some(chart) = shared("data/raw/colorchart.dng") else { return };
