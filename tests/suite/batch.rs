@@ -282,6 +282,32 @@ fn configuration_preset_and_command_line_in_that_order() {
     assert!(said.code == Some(2) && said.err.contains("archive"), "{}", said.err);
 }
 
+/// What a configuration says of pictures is for the merges that make some.
+#[test]
+fn a_configuration_for_pictures_does_not_disturb_merges_without() {
+    let dir = album();
+    std::fs::create_dir_all(dir.path().join("settings/unshaken")).unwrap();
+    let settings = "tonemap = \"reinhard:saturation=0\"\ngain-map = true\nno-align = true\nsharp = [1, 2]\nresponse = \"gamma:2.2\"\n";
+    std::fs::write(dir.path().join("settings/unshaken/config.toml"), settings).unwrap();
+    let merge = |more: &[&str]| {
+        let said = unshaken(dir.path(), &[&["merge", "--overwrite", "-o", "x.exr"], more, &["photos/p1.jpg", "photos/p2.jpg"]].concat());
+        (said.code, said.err)
+    };
+    let (code, said) = merge(&[]);
+    assert_eq!(code, Some(0), "{said}");
+    for (name, mapped) in [("x.png", false), ("x.jpg", true)] {
+        let (code, said) = merge(&["--preview", name]);
+        assert_eq!(code, Some(0), "{name}: {said}");
+        let file = std::fs::read(dir.path().join(name)).unwrap();
+        assert_eq!(file.windows(6).any(|w| w == b"hdrgm:"), mapped, "{name}");
+    }
+    // On the command line it is a mistake.
+    for option in ["--tonemap=reinhard", "--gain-map"] {
+        let (code, said) = merge(&["--config", "none", option]);
+        assert!(code == Some(2) && said.contains("--preview"), "{said}");
+    }
+}
+
 /// Every option of merge can stand in a configuration, and takes effect.
 #[test]
 fn a_configuration_holds_every_option_of_merge() {
@@ -526,7 +552,7 @@ fn an_interrupted_merge_leaves_nothing() {
 }
 
 /// The same of a batch: the merge that it runs stops as well, and what is unfinished will be merged again.
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 #[test]
 fn an_interrupted_batch_leaves_nothing_and_goes_on_later() {
     use std::io::{BufRead, BufReader};
@@ -549,8 +575,15 @@ fn an_interrupted_batch_leaves_nothing_and_goes_on_later() {
     assert!(child.try_wait().unwrap().is_none(), "it is still at work");
     assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
     assert_eq!(child.wait().unwrap().code(), Some(130));
-    // The merge holds no pipe of ours; give it the time that it has to leave.
-    std::thread::sleep(Duration::from_secs(3));
+    // What runs in our folder is ours: the merge has left as well, or does in the time that it is given.
+    let folder = std::fs::canonicalize(dir.path()).unwrap();
+    let running =
+        || std::fs::read_dir("/proc").unwrap().flatten().any(|e| std::fs::read_link(e.path().join("cwd")).is_ok_and(|p| p == folder));
+    let start = Instant::now();
+    while running() {
+        assert!(start.elapsed() < Duration::from_secs(6), "the merge goes on");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     assert_eq!(listing(&dir.path().join("out")), [".unshaken"]);
     let record: Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("out/.unshaken/x.json")).unwrap()).unwrap();
     assert_eq!((&record["status"], &record["hash"]), (&Value::from("interrupted"), &Value::from("")));
