@@ -1,6 +1,6 @@
 //! Figures 3 and 4: patches of shaken frames, the true PSF of each and the estimated one.
 
-use super::local::{self, RADIUS, centre, error, median, smoothed, true_psf};
+use super::local::{self, RADIUS, error, median, smoothed};
 use super::study::{Events, Exposures, Shaking, seconds};
 use super::{Joint, Lab, Report, sheet};
 use crate::error::Result;
@@ -9,6 +9,7 @@ use crate::image::Plane;
 use crate::pipeline::{Blind, Settings};
 use crate::psf::{Patch, Psf};
 use crate::synth::Drawn;
+use crate::tsf::psf_at;
 use glam::DVec2;
 use image::{RgbImage, imageops};
 
@@ -28,9 +29,9 @@ pub(super) fn run(lab: &mut Lab, events: Events) -> Result<Report> {
         let mut strips: [Vec<(String, RgbImage)>; 4] = Default::default();
         for (k, (patch, psf)) in local::measured(study, i, events)?.into_iter().enumerate() {
             let (x, y, side) = (patch.x, patch.y, patch.size);
-            let at = centre(&patch, size);
-            let truth = true_psf(&study.made.tsfs[i], at, RADIUS);
-            let by_tsf = true_psf(&study.joint.tsfs[i], at, RADIUS);
+            let at = patch.centred(size);
+            let truth = psf_at(&study.made.tsfs[i], at, RADIUS).values;
+            let by_tsf = psf_at(&study.joint.tsfs[i], at, RADIUS).values;
             let of = |p: &Plane| (error(p, &truth), error(&smoothed(p), &smoothed(&truth)));
             let (direct, global) = (of(&psf.values), of(&by_tsf));
             let wide = Psf { radius: RADIUS, values: truth.clone() }.extent();
@@ -87,9 +88,10 @@ pub(super) fn blind(lab: &mut Lab, events: Events) -> Result<Report> {
     let mut rows: Vec<Vec<(String, RgbImage)>> = vec![Vec::new(), Vec::new(), Vec::new()];
     let mut errors = Vec::new();
     for patch in &patches {
-        let at = centre(patch, (w, h));
-        let truth = pair.map(|i| true_psf(&study.made.tsfs[i], at, RADIUS));
-        let shifted = |s: DVec2| -> [Plane; 2] { std::array::from_fn(|k| moved(&true_psf(&found.tsfs[k], at, RADIUS + 8), RADIUS, s)) };
+        let at = patch.centred((w, h));
+        let truth = pair.map(|i| psf_at(&study.made.tsfs[i], at, RADIUS).values);
+        let shifted =
+            |s: DVec2| -> [Plane; 2] { std::array::from_fn(|k| moved(&psf_at(&found.tsfs[k], at, RADIUS + 8).values, RADIUS, s)) };
         let cost = |s: DVec2| shifted(s).iter().zip(&truth).map(|(a, b)| error(&smoothed(a), &smoothed(b)).powi(2)).sum::<f64>();
         let (mut best, mut step) = (DVec2::ZERO, 2.0);
         while step > 0.05 {
