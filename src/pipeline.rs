@@ -551,9 +551,9 @@ impl Run<'_> {
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
         let base = match &scene {
             Some(_) => None,
-            None => Some(
-                self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?,
-            ),
+            None => {
+                Some(self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?)
+            }
         };
         let mut latent = base.as_ref().map(Solution::cropped).or(scene.clone()).unwrap_or(initial.clone());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();

@@ -205,7 +205,7 @@ fn a_batch_goes_on_after_a_failure_and_resumes() {
     let at = |name: &str| dir.path().join(name);
     std::fs::write(
         at("m.toml"),
-        "[[bracket]]\nname = \"good\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nresponse = \"gamma:2.2\"\n\
+        "[[bracket]]\nname = \"good\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nsharp = \"1,2\"\nresponse = \"gamma:2.2\"\n\
          [[bracket]]\nname = \"bad\"\nframes = [\"photos/p1.jpg\", \"photos/p5.jpg\"]\n\
          [[bracket]]\nname = \"other\"\nframes = [\"photos/p5.jpg\", \"photos/p6.jpg\"]\nsharp = \"1,2\"\n",
     )
