@@ -193,6 +193,7 @@ pub(super) struct PhotoArgs {
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = TONEMAP_EXAMPLES)]
 pub(super) struct TonemapArgs {
     /// Linear image: OpenEXR, Radiance HDR or floating-point TIFF
     #[arg(value_name = "IN.exr")]
@@ -213,6 +214,11 @@ pub(super) struct TonemapArgs {
     #[arg(long)]
     pub overwrite: bool,
 }
+
+const TONEMAP_EXAMPLES: &str = "Examples:
+  unshaken tonemap night.exr -o night.png
+  unshaken tonemap night.exr -o night.jpg --tonemap reinhard-local:key=0.22,saturation=0.9 --quality 95
+  unshaken tonemap night.exr -o night.jpg --gain-map";
 
 /// Options of 'merge' come beside these.
 #[derive(Debug, Args)]
@@ -255,11 +261,18 @@ the same. Options of 'merge' that are about one bracket's frames apply to all.
 Exit codes: 0 all done, 1 some failed, 2 wrong command line, 3 none failed but some are degraded (with --strict), 130 interrupted.";
 
 #[derive(Debug, Args)]
+#[command(after_help = GENERATE_EXAMPLES)]
 pub(super) struct GenerateArgs {
     /// What to print
     #[arg(value_enum)]
     pub what: Generate,
 }
+
+const GENERATE_EXAMPLES: &str = "Examples:
+  unshaken generate bash > ~/.local/share/bash-completion/completions/unshaken
+  unshaken generate zsh > ~/.zfunc/_unshaken
+  unshaken generate fish > ~/.config/fish/completions/unshaken.fish
+  unshaken generate man > unshaken.1 && man ./unshaken.1";
 
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 pub(super) enum Generate {
@@ -274,6 +287,7 @@ pub(super) enum Generate {
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = CALIBRATE_EXAMPLES)]
 pub(super) struct CalibrateArgs {
     /// Frames of one scene without shake (PNG, JPEG or TIFF), at two or more exposure times
     #[arg(required = true, value_name = "FRAME")]
@@ -291,6 +305,10 @@ pub(super) struct CalibrateArgs {
     #[arg(long)]
     pub overwrite: bool,
 }
+
+const CALIBRATE_EXAMPLES: &str = "Examples:
+  unshaken calibrate -o camera.json TRIPOD_1.jpg TRIPOD_2.jpg TRIPOD_3.jpg
+  unshaken calibrate -o camera.json --method mitsunaga --exposures 1/30,1/8,0.5 a.png b.png c.png";
 
 /// How a response is calibrated.
 #[derive(Clone, Copy, Debug, PartialEq, ValueEnum)]

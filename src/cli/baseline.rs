@@ -13,7 +13,12 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "Examples:
+  unshaken baseline --truth bracket/truth.exr --output-dir others bracket/frame*.png
+  unshaken baseline --method debevec,mertens --output-dir others IMG_1.jpg IMG_2.jpg IMG_3.jpg";
+
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct BaselineArgs {
     /// Frames of one scene, counted from 1
     #[arg(required = true, value_name = "FRAME")]

@@ -11,7 +11,13 @@ use clap::{Args, ValueEnum};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "Examples:
+  unshaken compare result.exr truth.exr --map error.png
+  unshaken compare --align rigid --json a.exr b.exr truth.exr
+  unshaken compare --no-reference a.jpg b.jpg";
+
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct CompareArgs {
     /// One or more results and, last, the truth: linear OpenEXR of one size. With --no-reference pictures (PNG, JPEG, TIFF or EXR)
     #[arg(required = true, value_name = "RESULT.exr... TRUTH.exr")]

@@ -9,7 +9,12 @@ use clap::Args;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "Examples:
+  unshaken experiment fig5 --output-dir experiments
+  unshaken experiment all --output-dir experiments";
+
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct ExperimentArgs {
     /// fig3, fig4, tsf, fig5, fig6, ..., fig12, sharpness, office, or all
     #[arg(value_name = "NAME")]

@@ -76,6 +76,8 @@ pub(super) struct Opened {
     /// Of each frame, linear RGB to XYZ relative to D50.
     pub to_xyz: Vec<Matrix>,
     metadata: Vec<Metadata>,
+    /// Exposures are 2^EV, not seconds.
+    relative: bool,
     notes: Vec<String>,
 }
 
@@ -129,6 +131,7 @@ impl<'a> Job<'a> {
             ))
             .into());
         }
+        let relative = self.values.is_some() || self.times.is_none() && metadata.iter().any(|m| m.exposure_time.is_none());
         let linear = matches!(&stated, Some((_, Response::Linear)));
         if linear && let Some(word) = args.response.as_deref().filter(|w| *w != "linear") {
             return Err(Usage(format!("--response {word}: the frames are linear already; leave --response out")).into());
@@ -147,7 +150,7 @@ impl<'a> Job<'a> {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
-        Ok(Opened { bracket: Arc::new(bracket), response, origin, degraded, noise, to_xyz, metadata, notes })
+        Ok(Opened { bracket: Arc::new(bracket), response, origin, degraded, noise, to_xyz, metadata, relative, notes })
     }
 
     /// The settings for frames of full size.
@@ -220,7 +223,8 @@ impl<'a> Job<'a> {
         }
 
         // All are complete before the first is renamed.
-        let style = exr::Style { primaries: photo.primaries, half: args.photo.half, metadata: noted.clone(), absolute, layers };
+        let (primaries, half, metadata) = (photo.primaries, args.photo.half, noted.clone());
+        let style = exr::Style { primaries, half, metadata, absolute, relative: opened.relative, layers };
         let (staged, clipped) = targets.linear.stage_linear(&linear, &radiometry, &style)?;
         if clipped > OUTSIDE {
             events(Event::Warning(format!(
@@ -260,7 +264,7 @@ impl<'a> Job<'a> {
             return Err(Error::Cancelled.into());
         }
         output::commit_all(staged)?;
-        Ok(summary(args, bracket, outcome.reference))
+        Ok(summary(args, bracket, outcome.reference, opened.relative))
     }
 }
 
@@ -356,16 +360,16 @@ pub(super) fn check_gain_map(asked: bool, option: &str, path: &Path) -> Result<(
     Ok(())
 }
 
-fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize) -> String {
+fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize, relative: bool) -> String {
     let (width, height) = bracket.size();
     let frame = &bracket.frames()[reference];
     let what = if args.photo.absolute { "cd/m2; white is that" } else { "1.0 is the white" };
     format!(
-        "wrote {} ({width} x {height}; {what} of frame {}, {}, at {} s)",
+        "wrote {} ({width} x {height}; {what} of frame {}, {}, at {})",
         args.output.display(),
         reference + 1,
         frame.name,
-        frame.exposure_time
+        if relative { format!("{:+} EV", frame.exposure_time.log2()) } else { format!("{} s", frame.exposure_time) }
     )
 }
 

@@ -78,7 +78,7 @@ pub(super) fn parse(arguments: Vec<OsString>) -> Result<Parsed, Refused> {
         let name = name.as_str();
         let sub = matches.subcommand_matches(name).expect("its name is there");
         let described = command.find_subcommand(name).expect("matched").clone();
-        let added = configured(&described, sub).map_err(Refused::Other)?;
+        let added = configured(&described, sub, printing).map_err(Refused::Other)?;
         if !added.is_empty() {
             let at = arguments.iter().skip(1).position(|a| a == name).map_or(arguments.len(), |i| i + 2);
             let mut all = arguments.clone();
@@ -98,8 +98,9 @@ pub(super) fn parse(arguments: Vec<OsString>) -> Result<Parsed, Refused> {
     Ok(Parsed::Line(Box::new(Line { line, merge_options })))
 }
 
-/// What the configuration and the preset add to the command line.
-fn configured(command: &Command, sub: &ArgMatches) -> anyhow::Result<Vec<OsString>> {
+/// What the configuration and the preset add to the command line. Unless it is only printed: how pictures are made does not matter to a merge
+/// that makes none, nor a gain map to one that makes a PNG.
+fn configured(command: &Command, sub: &ArgMatches, printing: bool) -> anyhow::Result<Vec<OsString>> {
     let named = sub.get_one::<PathBuf>("config");
     let path = match named {
         Some(p) if p == Path::new("none") => None,
@@ -134,6 +135,16 @@ fn configured(command: &Command, sub: &ArgMatches) -> anyhow::Result<Vec<OsStrin
     tables.push((shown, file));
     let merge = super::options::command().find_subcommand("merge").expect("ours").clone();
     let from_line = |id: &str| sub.try_contains_id(id).unwrap_or(false) && sub.value_source(id) == Some(ValueSource::CommandLine);
+    let idle = |key: &str| {
+        let (Some(line), false) = (sub.try_get_one::<PathBuf>("preview").ok(), printing) else { return false };
+        let named = tables.iter().find_map(|(_, table)| table.get("preview")?.as_str()).map(PathBuf::from);
+        let ending = line.cloned().or(named).map(|p| crate::io::output::ending(&p));
+        match key {
+            "tonemap" => ending.is_none(),
+            "gain-map" => ending.is_none_or(|e| e == "png"),
+            _ => false,
+        }
+    };
     let (mut arguments, mut seen) = (Vec::new(), Vec::new());
     for (source, table) in &tables {
         for (key, value) in table {
@@ -148,7 +159,7 @@ fn configured(command: &Command, sub: &ArgMatches) -> anyhow::Result<Vec<OsStrin
                     .iter()
                     .any(|c| from_line(c.get_id().as_str()) || seen.contains(&c.get_id().to_string()));
             // Another command may not have the option.
-            if overridden || seen.contains(&arg.get_id().to_string()) || known(command).is_none() {
+            if overridden || idle(key) || seen.contains(&arg.get_id().to_string()) || known(command).is_none() {
                 continue;
             }
             seen.push(arg.get_id().to_string());

@@ -12,7 +12,12 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+const EXAMPLES: &str = "Examples:
+  unshaken preview IMG_1.jpg IMG_2.jpg IMG_3.jpg
+  unshaken preview --blur session.json";
+
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct PreviewArgs {
     /// Frames of one scene, or a saved session (.json); more can be opened in the window
     #[arg(value_name = "FRAME")]

@@ -16,7 +16,12 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "Examples:
+  unshaken synth --scene window --tripod --output-dir bracket
+  unshaken synth photograph.exr --exposures 1/30,1/8,1 --extent 20 --seed 7 --output-dir bracket";
+
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct SynthArgs {
     /// Linear OpenEXR photograph to take as the scene
     #[arg(value_name = "SCENE.exr", required_unless_present = "scene", conflicts_with = "scene")]

@@ -31,6 +31,8 @@ pub struct Style {
     pub metadata: Metadata,
     /// `Some`: pixels are luminances, cd/m² = value; the number is that of the reference frame's white.
     pub absolute: Option<f64>,
+    /// Exposures are relative, 2^EV instead of seconds: no exposure time is written but the one that the camera noted.
+    pub relative: bool,
     /// Further channels, each with its name, such as `confidence.Y`.
     pub layers: Vec<(String, Plane)>,
 }
@@ -78,18 +80,17 @@ pub fn write_styled(to: impl Write + Seek, image: &Rgb, radiometry: &Radiometry,
     let channels = AnyChannels::sort(channels.collect());
     let noted = &style.metadata;
     let words = |t: &Option<String>| t.as_deref().and_then(|t| Text::new_or_none(ascii(t)));
+    let (exposure, seconds) = match style.relative {
+        true => (format!("exposure (2^EV = {})", radiometry.exposure_time), None),
+        false => (format!("exposure time ({} s)", radiometry.exposure_time), Some(radiometry.exposure_time)),
+    };
     let rule = match style.absolute {
         Some(white) => format!(
             "value = luminance in cd/m2, from aperture, ISO speed and exposure time of the reference frame {} (white {white:.4} cd/m2); \
-             irradiance x {} s = value / {white}",
-            ascii(&radiometry.frame),
-            radiometry.exposure_time
+             irradiance x its {exposure} = value / {white}",
+            ascii(&radiometry.frame)
         ),
-        None => format!(
-            "1.0 is the white of the reference frame {}: value = irradiance x its exposure time ({} s)",
-            ascii(&radiometry.frame),
-            radiometry.exposure_time
-        ),
+        None => format!("1.0 is the white of the reference frame {}: value = irradiance x its {exposure}", ascii(&radiometry.frame)),
     };
     let text = |name: &str, value: &Option<String>| Some((Text::from(name), AttributeValue::Text(words(value)?)));
     let mut other: Vec<(Text, AttributeValue)> =
@@ -110,7 +111,7 @@ pub fn write_styled(to: impl Write + Seek, image: &Rgb, radiometry: &Radiometry,
     let attributes = LayerAttributes {
         software_name: Some(concat!("unshaken ", env!("CARGO_PKG_VERSION")).into()),
         comments: Text::new_or_none(rule),
-        exposure: Some(noted.exposure_time.filter(|t| *t > 0.0).unwrap_or(radiometry.exposure_time) as f32),
+        exposure: noted.exposure_time.filter(|t| *t > 0.0).or(seconds).map(|t| t as f32),
         aperture: noted.f_number.map(|v| v as f32),
         iso_speed: noted.iso.map(|v| v as f32),
         capture_date: noted

@@ -3,6 +3,8 @@
 //! The frame stays in camera RGB, each channel 1 where it saturates: what the solver sees is what the sensor recorded, shot noise and
 //! saturation included. White balance and the camera's matrix belong to the result and come along as one matrix.
 
+mod directories;
+
 use super::metadata::{self, Metadata};
 use crate::colour::{self, Matrix, Primaries};
 use crate::image::{Plane, Rgb};
@@ -40,7 +42,7 @@ pub fn is_raw_name(ending: &str) -> bool {
 /// # Errors
 /// Why it cannot be, with the remedy, in words that follow the file's name.
 pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
-    check_directories(&bytes)?;
+    directories::check(&bytes)?;
     let noted = metadata::read_bytes(&bytes);
     quietly(move || {
         let source = RawSource::new_from_shared_vec(bytes.into());
@@ -61,56 +63,6 @@ pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
 
 /// Pixels per byte that no compression of raw files reaches.
 const LEAST_DENSE: usize = 64;
-
-/// Refuses TIFF directories whose entries claim more values than the file has bytes, in files that are built like TIFF: rawler asks for memory
-/// for as many.
-fn check_directories(bytes: &[u8]) -> Result<(), String> {
-    let little = match bytes.get(..2) {
-        Some(b"II") => true,
-        Some(b"MM") => false,
-        _ => return Ok(()),
-    };
-    let number = |at: usize, length: usize| {
-        let part = bytes.get(at..at.checked_add(length)?)?;
-        let join = |n: usize, b: &u8| n << 8 | usize::from(*b);
-        Some(if little { part.iter().rev().fold(0, join) } else { part.iter().fold(0, join) })
-    };
-    let damaged = || "is truncated or damaged (a directory that cannot be); copy it again from the camera".to_string();
-    let mut waiting = vec![number(4, 4).ok_or_else(damaged)?];
-    let mut seen = Vec::new();
-    while let Some(at) = waiting.pop() {
-        if at == 0 || seen.contains(&at) {
-            continue;
-        }
-        seen.push(at);
-        let Some(entries) = number(at, 2) else { continue };
-        for entry in (0..entries).map(|i| at + 2 + 12 * i) {
-            let (Some(tag), Some(kind), Some(count), Some(value)) =
-                (number(entry, 2), number(entry + 2, 2), number(entry + 4, 4), number(entry + 8, 4))
-            else {
-                return Err(damaged());
-            };
-            let size = match kind {
-                1 | 2 | 6 | 7 => 1,
-                3 | 8 => 2,
-                4 | 9 | 11 | 13 => 4,
-                _ => 8,
-            };
-            if count * size > bytes.len() {
-                return Err(damaged());
-            }
-            // SubIFDs, EXIF and GPS.
-            if matches!(tag, 330 | 34665 | 34853) {
-                match count {
-                    1 => waiting.push(value),
-                    n => waiting.extend((0..n).filter_map(|i| number(value + 4 * i, 4))),
-                }
-            }
-        }
-        waiting.extend(number(at + 2 + 12 * entries, 4));
-    }
-    Ok(())
-}
 
 /// Refuses sizes that cannot be before memory is asked for them: that would end the program.
 fn check_size(decoder: &dyn Decoder, bytes: usize) -> Result<(), String> {

@@ -95,6 +95,28 @@ fn brackets_are_found_by_time_size_and_exposure() {
     assert!(!said.out.contains("[[bracket]]"), "{}", said.out);
 }
 
+/// Two people photograph side by side; their files come into one folder.
+#[test]
+fn brackets_of_two_cameras_are_told_apart() {
+    let dir = tempdir().unwrap();
+    for (name, model, time, clock) in [
+        ("1.jpg", "Model 1", (1, 8), "2024:05:06 12:00:00"),
+        ("2.jpg", "Model 2", (1, 4), "2024:05:06 12:00:00"),
+        ("3.jpg", "Model 1", (1, 1), "2024:05:06 12:00:01"),
+        ("4.jpg", "Model 2", (2, 1), "2024:05:06 12:00:01"),
+    ] {
+        photos::write_jpeg(
+            &dir.path().join(name),
+            &image::RgbImage::new(32, 24),
+            &Notes { time: Some(time), taken: Some(clock), model, ..Notes::default() },
+        );
+    }
+    let said = unshaken(dir.path(), &["batch", ".", "--output-dir", "out", "--dry-run"]);
+    let manifest: toml::Table = said.out.parse().unwrap();
+    let frames: Vec<String> = manifest["bracket"].as_array().unwrap().iter().map(|b| b["frames"].to_string()).collect();
+    assert_eq!(frames, [r#"["./1.jpg", "./3.jpg"]"#, r#"["./2.jpg", "./4.jpg"]"#], "{}", said.out);
+}
+
 /// Every bracket of exactly one shard, for all counts.
 #[test]
 fn shards_are_an_exact_partition() {
@@ -127,13 +149,63 @@ fn shards_are_an_exact_partition() {
     }
 }
 
+/// The job files of the documentation, as their schedulers' tasks run them: each bracket is of exactly one task.
+#[cfg(unix)]
+#[test]
+fn the_documented_job_files_split_the_work_exactly() {
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/BATCH.md")).unwrap();
+    let between = |from: &str, to: &str| -> String {
+        let at = text.find(from).unwrap_or_else(|| panic!("the documentation lacks {from:?}"));
+        text[at..at + text[at..].find(to).unwrap()].to_string()
+    };
+    let slurm = between("#!/bin/sh\n#SBATCH", "```");
+    let kubernetes = between("exec unshaken batch --manifest brackets.toml --output-dir merged --json", "resources:");
+    // What YAML makes of a text over several lines.
+    let kubernetes = kubernetes.split_whitespace().collect::<Vec<_>>().join(" ");
+    let dir = tempdir().unwrap();
+    let brackets: Vec<String> = (0..8).map(|i| format!("b{i}")).collect();
+    let table = |name: &String| format!("[[bracket]]\nname = \"{name}\"\nframes = [\"{name}-1.jpg\", \"{name}-2.jpg\"]\n");
+    std::fs::write(dir.path().join("brackets.toml"), brackets.iter().map(table).collect::<String>()).unwrap();
+    let program = Path::new(env!("CARGO_BIN_EXE_unshaken")).parent().unwrap();
+    let path = format!("{}:{}", program.display(), std::env::var("PATH").unwrap());
+    let task = |script: &str, variables: &[(&str, String)]| {
+        let mut command = Command::new("/bin/sh");
+        command.args(["-c", script]).current_dir(dir.path()).env("PATH", &path).env("XDG_CONFIG_HOME", dir.path());
+        let out = command.envs(variables.iter().map(|(k, v)| (k, v))).output().unwrap();
+        let said = String::from_utf8_lossy(&out.stdout).into_owned();
+        // Their frames are not there: each fails, and says so.
+        assert_eq!(out.status.code(), Some(1), "{said}{}", String::from_utf8_lossy(&out.stderr));
+        said
+    };
+    let (mut of_kubernetes, mut of_slurm) = (Vec::new(), Vec::new());
+    for i in 0..4 {
+        let said = task(&kubernetes, &[("JOB_COMPLETION_INDEX", i.to_string())]);
+        let events = said.lines().filter_map(|l| serde_json::from_str::<Value>(l).ok()).filter(|e| e["event"] == "bracket");
+        let names: Vec<String> = events.map(|e| e["name"].as_str().unwrap().to_string()).collect();
+        assert_eq!(names.len(), 2, "{said}");
+        of_kubernetes.extend(names);
+        let said = task(&slurm, &[("SLURM_ARRAY_TASK_ID", (i + 1).to_string()), ("SLURM_ARRAY_TASK_COUNT", "4".to_string())]);
+        let names: Vec<String> = said
+            .lines()
+            .filter(|l| l.contains(" failed "))
+            .map(|l| l.split(' ').next().unwrap().to_string())
+            .filter(|n| brackets.contains(n))
+            .collect();
+        assert_eq!(names.len(), 2, "{said}");
+        of_slurm.extend(names);
+    }
+    of_kubernetes.sort();
+    of_slurm.sort();
+    assert_eq!((&of_kubernetes, &of_slurm), (&brackets, &brackets));
+}
+
 #[test]
 fn a_batch_goes_on_after_a_failure_and_resumes() {
     let dir = album();
     let at = |name: &str| dir.path().join(name);
     std::fs::write(
         at("m.toml"),
-        "[[bracket]]\nname = \"good\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nresponse = \"gamma:2.2\"\n\
+        "[[bracket]]\nname = \"good\"\nframes = [\"photos/p1.jpg\", \"photos/p2.jpg\"]\nsharp = \"1,2\"\nresponse = \"gamma:2.2\"\n\
          [[bracket]]\nname = \"bad\"\nframes = [\"photos/p1.jpg\", \"photos/p5.jpg\"]\n\
          [[bracket]]\nname = \"other\"\nframes = [\"photos/p5.jpg\", \"photos/p6.jpg\"]\nsharp = \"1,2\"\n",
     )
@@ -210,6 +282,32 @@ fn configuration_preset_and_command_line_in_that_order() {
     assert!(said.code == Some(2) && said.err.contains("archive"), "{}", said.err);
 }
 
+/// What a configuration says of pictures is for the merges that make some.
+#[test]
+fn a_configuration_for_pictures_does_not_disturb_merges_without() {
+    let dir = album();
+    std::fs::create_dir_all(dir.path().join("settings/unshaken")).unwrap();
+    let settings = "tonemap = \"reinhard:saturation=0\"\ngain-map = true\nno-align = true\nsharp = [1, 2]\nresponse = \"gamma:2.2\"\n";
+    std::fs::write(dir.path().join("settings/unshaken/config.toml"), settings).unwrap();
+    let merge = |more: &[&str]| {
+        let said = unshaken(dir.path(), &[&["merge", "--overwrite", "-o", "x.exr"], more, &["photos/p1.jpg", "photos/p2.jpg"]].concat());
+        (said.code, said.err)
+    };
+    let (code, said) = merge(&[]);
+    assert_eq!(code, Some(0), "{said}");
+    for (name, mapped) in [("x.png", false), ("x.jpg", true)] {
+        let (code, said) = merge(&["--preview", name]);
+        assert_eq!(code, Some(0), "{name}: {said}");
+        let file = std::fs::read(dir.path().join(name)).unwrap();
+        assert_eq!(file.windows(6).any(|w| w == b"hdrgm:"), mapped, "{name}");
+    }
+    // On the command line it is a mistake.
+    for option in ["--tonemap=reinhard", "--gain-map"] {
+        let (code, said) = merge(&["--config", "none", option]);
+        assert!(code == Some(2) && said.contains("--preview"), "{said}");
+    }
+}
+
 /// Every option of merge can stand in a configuration, and takes effect.
 #[test]
 fn a_configuration_holds_every_option_of_merge() {
@@ -269,8 +367,26 @@ fn completions_and_the_manual_page_know_every_command() {
     if let Ok(out) = Command::new("bash").args(["-c", script]).current_dir(dir.path()).output() {
         assert_eq!(String::from_utf8_lossy(&out.stdout).trim(), "--primaries", "{}", String::from_utf8_lossy(&out.stderr));
     }
-    for command in ["merge", "batch"] {
-        assert!(unshaken(dir.path(), &[command, "--help"]).out.contains("Examples:"), "{command}");
+    // The others' grammars, by those who know them.
+    for (what, program, check) in [("zsh", "zsh", "-n"), ("fish", "fish", "--no-execute"), ("man", "groff", "-man -ww -z -Tutf8")] {
+        let file = dir.path().join(what);
+        std::fs::write(&file, unshaken(dir.path(), &["generate", what]).out).unwrap();
+        let Ok(out) = Command::new(program).args(check.split(' ')).arg(&file).output() else {
+            use std::io::Write;
+            let _ = writeln!(std::io::stderr(), "SKIPPED {what} of completions_and_the_manual_page: {program} is not there");
+            continue;
+        };
+        assert!(out.status.success() && out.stderr.is_empty(), "{what}: {}", String::from_utf8_lossy(&out.stderr));
+    }
+    let help = unshaken(dir.path(), &["--help"]).out;
+    let listed = help.split("Commands:\n").nth(1).unwrap().split("\n\n").next().unwrap();
+    let commands: Vec<&str> = listed.lines().filter_map(|l| l.split_whitespace().next()).collect();
+    assert!(help.contains("Examples:") && commands.len() >= 10, "{help}");
+    // Those need no arguments.
+    for command in commands.into_iter().filter(|c| !["demo", "adapters", "help"].contains(c)) {
+        let help = unshaken(dir.path(), &[command, "--help"]).out;
+        let examples = help.split("Examples:\n").nth(1).unwrap_or_else(|| panic!("{command} shows no examples"));
+        assert!(examples.contains(&format!("  unshaken {command} ")), "{command}: {examples}");
     }
 }
 
@@ -433,4 +549,42 @@ fn an_interrupted_merge_leaves_nothing() {
     assert_eq!(code, Some(130));
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
     assert_eq!(listing(dir.path()), before);
+}
+
+/// The same of a batch: the merge that it runs stops as well, and what is unfinished will be merged again.
+#[cfg(target_os = "linux")]
+#[test]
+fn an_interrupted_batch_leaves_nothing_and_goes_on_later() {
+    use std::io::{BufRead, BufReader};
+    let dir = tempdir().unwrap();
+    for (name, time) in [("a.jpg", (1, 8)), ("b.jpg", (1, 2)), ("c.jpg", (2, 1))] {
+        photograph(&dir.path().join(name), (700, 500), time, "2024:05:06 12:00:00");
+    }
+    std::fs::write(dir.path().join("m.toml"), "[[bracket]]\nname = \"x\"\nframes = [\"a.jpg\", \"b.jpg\", \"c.jpg\"]\nsharp = 1\n")
+        .unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_unshaken"))
+        .current_dir(dir.path())
+        .args(["batch", "--manifest", "m.toml", "--output-dir", "out", "--json"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    assert!(lines.any(|l| l.unwrap().contains("bracket-started")));
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(child.try_wait().unwrap().is_none(), "it is still at work");
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    // What runs in our folder is ours: the merge has left as well, or does in the time that it is given.
+    let folder = std::fs::canonicalize(dir.path()).unwrap();
+    let running =
+        || std::fs::read_dir("/proc").unwrap().flatten().any(|e| std::fs::read_link(e.path().join("cwd")).is_ok_and(|p| p == folder));
+    let start = Instant::now();
+    while running() {
+        assert!(start.elapsed() < Duration::from_secs(6), "the merge goes on");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    assert_eq!(listing(&dir.path().join("out")), [".unshaken"]);
+    let record: Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("out/.unshaken/x.json")).unwrap()).unwrap();
+    assert_eq!((&record["status"], &record["hash"]), (&Value::from("interrupted"), &Value::from("")));
 }

@@ -102,6 +102,12 @@ fn raw_files_that_cannot_be_developed_are_refused() {
         let text = error(bytes);
         assert!(text.contains("a.dng") && (text.contains("copy it again") || text.contains("DNG")) && text.lines().count() == 1, "{text}");
     }
+    // No DNG, and of a make that nobody knows.
+    let mut foreign = whole.clone();
+    let version = whole.windows(4).position(|w| w == [0x12, 0xC6, 1, 0]).unwrap();
+    foreign[version] = 0x13;
+    let text = error(&foreign);
+    assert!(text.contains("a.dng") && text.contains("not supported (Maker Model 1") && text.contains("convert it to DNG"), "{text}");
     // Every byte of the header wrong, one at a time: an error or a picture, never a panic.
     for at in 0..600 {
         let mut bytes = whole.clone();
@@ -109,6 +115,49 @@ fn raw_files_that_cannot_be_developed_are_refused() {
         std::fs::write(&path, &bytes).unwrap();
         let _ = input::read(&path, 1.0);
     }
+}
+
+/// Directories that lead to themselves, or are named again and again: rawler would follow them until there is no memory.
+#[test]
+fn raw_files_whose_directories_have_no_end_are_refused() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    let whole = photos::dng(&colours(64, 48), &Notes::default());
+    let refused = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let text = input::read(&path, 1.0).unwrap_err().to_string();
+        assert!(text.contains("a.dng") && text.contains("directory that cannot be") && text.contains("copy it again"), "{text}");
+    };
+    // The next directory is this one.
+    let entries = usize::from(u16::from_le_bytes([whole[8], whole[9]]));
+    let next = 10 + 12 * entries;
+    assert_eq!(whole[next..next + 4], [0; 4]);
+    let mut circle = whole.clone();
+    circle[next] = 8;
+    refused(&circle);
+    // The same, seen only by who reads on where a value is missing: a last entry whose place cannot be.
+    let mut odd = circle.clone();
+    odd[next - 8..next].copy_from_slice(&[5, 0, 0, 0, 255, 255, 255, 255]);
+    refused(&odd);
+    // A hundred thousand directories below it, all one and the same.
+    let mut many = whole.clone();
+    let exif = (0..entries).map(|i| 10 + 12 * i).find(|at| whole[*at..*at + 2] == 34665u16.to_le_bytes()).unwrap();
+    let (place, below) = (many.len() as u32, whole[exif + 8..exif + 12].to_vec());
+    many[exif + 4..exif + 8].copy_from_slice(&100_000u32.to_le_bytes());
+    many[exif + 8..exif + 12].copy_from_slice(&place.to_le_bytes());
+    many.extend(below.repeat(100_000));
+    refused(&many);
+    // The notes of a CR3 file are such files within boxes.
+    let sized = |name: &[u8], content: &[u8]| [&(content.len() as u32 + 8).to_be_bytes()[..], name, content].concat();
+    let id = [0x85, 0xc0, 0xb6, 0x87, 0x82, 0x0f, 0x11, 0xe0, 0x81, 0x11, 0xf4, 0xce, 0x46, 0x2b, 0x6a, 0x48];
+    let cr3 = |notes: &[u8]| {
+        let canon = sized(b"uuid", &[&id[..], notes].concat());
+        [sized(b"ftyp", b"crx \0\0\0\x01crx isom"), sized(b"moov", &canon)].concat()
+    };
+    refused(&cr3(&sized(b"CMT1", &circle)));
+    let mut long = sized(b"CMT1", &whole);
+    long[..4].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff]);
+    refused(&cr3(&long));
 }
 
 #[test]
@@ -122,6 +171,20 @@ fn a_real_dng_decodes_and_its_missing_times_are_refused() {
     assert!(means.iter().all(|m| *m > 0.01 && *m < 0.9), "{means:?}");
     let error = metadata::exposures(&[(chart.clone(), &frame.metadata)]).unwrap_err().to_string();
     assert!(error.contains("colorchart.dng") && error.contains("--exposures"), "{error}");
+    // The same from outside: refused with the remedy, and the remedy helps.
+    let dir = tempdir().unwrap();
+    std::fs::copy(&chart, dir.path().join("colorchart.dng")).unwrap();
+    std::fs::copy(&chart, dir.path().join("again.dng")).unwrap();
+    let merge = |more: &[&str]| {
+        let line = ["merge", "--no-align", "--sharp", "1,2", "--scale", "0.1", "-o", "x.exr"];
+        unshaken(dir.path(), &[&line[..], more, &["colorchart.dng", "again.dng"]].concat())
+    };
+    let (code, said) = merge(&[]);
+    assert!(code == Some(1) && said.contains("colorchart.dng") && said.contains("0 s") && said.contains("--exposures"), "{said}");
+    assert!(!dir.path().join("x.exr").exists());
+    let (code, said) = merge(&["--exposures", "1/10,1/9"]);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(exr::read_file(&dir.path().join("x.exr")).unwrap().image.0[1].data.iter().any(|v| *v > 0.1));
 }
 
 fn noted(time: Option<f64>, f_number: Option<f64>, iso: Option<f64>, bias: Option<f64>) -> Metadata {
@@ -382,7 +445,7 @@ fn other_readers_find_attributes_layers_and_colours() {
     let notes = Notes { taken: Some("2024:05:06 07:08:09"), artist: Some("A. Person"), ..Notes::default() };
     let metadata = metadata::read_bytes(&png_with(&notes.exif()));
     let layers = vec![("confidence.Y".to_string(), Plane::filled(24, 16, 0.25))];
-    let style = Style { primaries: Primaries::Rec2020, half: true, metadata, absolute: None, layers };
+    let style = Style { primaries: Primaries::Rec2020, half: true, metadata, layers, ..Style::default() };
     let radiometry = Radiometry { exposure_time: 0.125, frame: "a.jpg".into() };
     Output::check(&path, false).unwrap().stage_linear(&image, &radiometry, &style).unwrap().0.commit().unwrap();
     let script = r#"
@@ -396,6 +459,7 @@ print(json.dumps({
   "confidence": num(c["confidence.Y"].pixels[3, 3]), "chromaticities": [num(v) for v in h["chromaticities"]],
   "expTime": num(h["expTime"]), "aperture": num(h["aperture"]), "isoSpeed": num(h["isoSpeed"]), "capDate": h["capDate"],
   "owner": h["owner"], "whiteLuminance": num(h["whiteLuminance"]), "comments": h["comments"], "latitude": num(h["latitude"]),
+  "compression": str(h["compression"]), "software": h["software"],
 }))"#;
     let out = Command::new("python3").args(["-c", script]).arg(&path).output();
     let known = out.as_ref().is_ok_and(|o| !String::from_utf8_lossy(&o.stderr).contains("No module named"));
@@ -421,6 +485,8 @@ print(json.dumps({
     );
     assert_eq!((&read["capDate"], &read["owner"]), (&serde_json::json!("2024:05:06 07:08:09"), &serde_json::json!("A. Person")));
     assert!(read["comments"].as_str().unwrap().starts_with("1.0 is the white of the reference frame a.jpg"), "{read}");
+    assert!(read["compression"].as_str().unwrap().contains("ZIP_COMPRESSION"), "{read}");
+    assert!(read["software"].as_str().unwrap().starts_with("unshaken "), "{read}");
     // And our own reader knows the primaries again.
     let file = exr::read_file(&path).unwrap();
     assert!(
@@ -700,4 +766,194 @@ fn a_bracket_by_aperture_and_speed_is_merged_upright() {
         let ratio = at(x, y) / truth(x, y) / (at(5, 5) / truth(5, 5));
         assert!((ratio - 1.0).abs() < 0.06, "({x}, {y}): {ratio}");
     }
+}
+
+/// Photographs of one scene, in a curve of 1/2.2, at `light` times its irradiance.
+fn photograph(path: &Path, scene: &Plane, light: f64, notes: Option<&Notes>) {
+    let picture = image::RgbImage::from_fn(scene.width as u32, scene.height as u32, |x, y| {
+        let e = f64::from(scene.at(x as usize, y as usize)) * light;
+        image::Rgb([(e.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8; 3])
+    });
+    match notes {
+        Some(notes) => photos::write_jpeg(path, &picture, notes),
+        None => picture.save(path).unwrap(),
+    }
+}
+
+fn largest_difference(a: &Rgb, b: &Rgb, factor: f32) -> f32 {
+    let pairs = a.0.iter().zip(&b.0).flat_map(|(a, b)| a.data.iter().zip(&b.data));
+    pairs.map(|(a, b)| (a - factor * b).abs() / (factor * b).max(0.02)).fold(0.0, f32::max)
+}
+
+/// Relative exposures: for files that note nothing, and before what files note; the same as times that are 2^EV, but never said to be seconds.
+#[test]
+fn relative_exposures_stand_for_times() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let scene = scene(80, 60, 1.5);
+    for (i, light) in [0.25, 1.0, 4.0].into_iter().enumerate() {
+        photograph(&at(&format!("{i}.png")), &scene, light, None);
+        // Its clock is wrong: all frames took as long.
+        photograph(&at(&format!("{i}.jpg")), &scene, light, Some(&Notes::default()));
+    }
+    let merge = |name: &str, line: &str| {
+        let line = format!("merge --no-align --response gamma:2.2 --overwrite -o {name}.exr --report {name}.json {line}");
+        let (code, said) = unshaken(dir.path(), &line.split_whitespace().collect::<Vec<_>>());
+        assert_eq!(code, Some(0), "{said}");
+        let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(at(&format!("{name}.json"))).unwrap()).unwrap();
+        let times: Vec<f64> = report["frames"].as_array().unwrap().iter().map(|f| f["exposure_time_s"].as_f64().unwrap()).collect();
+        (exr::read_file(&at(&format!("{name}.exr"))).unwrap(), times, said)
+    };
+    let header =
+        |name: &str| ::exr::meta::MetaData::read_from_file(at(&format!("{name}.exr")), false).unwrap().headers[0].own_attributes.clone();
+    let (ev, times, said) = merge("ev", "--sharp 1,2,3 --ev -2,0,+2 0.png 1.png 2.png");
+    assert_eq!((times, ev.factor), (vec![0.25, 1.0, 4.0], Some(4.0)));
+    assert!(said.contains("2.png, at +2 EV)"), "{said}");
+    let own = header("ev");
+    assert_eq!(own.exposure, None, "nobody knows how many seconds that is");
+    assert!(own.comments.unwrap().to_string().ends_with("irradiance x its exposure (2^EV = 4)"));
+    let (seconds, _, said) = merge("s", "--sharp 1,2,3 --exposures 1/4,1,4 0.png 1.png 2.png");
+    assert!(seconds.image == ev.image && said.contains("at 4 s)") && header("s").exposure == Some(4.0), "{said}");
+    // The order of the frames does not change the scale.
+    let (turned, _, _) = merge("t", "--sharp 1,2,3 --ev 2,-2,0 2.png 0.png 1.png");
+    let off = largest_difference(&turned.image, &ev.image, 1.0);
+    assert!(turned.factor == Some(4.0) && off < 1e-3, "off by {off}");
+    // Before what the files note; what the camera noted as its time stays a note.
+    let (jpeg, times, said) = merge("j", "--sharp 1,2,3 --ev -2,0,2 0.jpg 1.jpg 2.jpg");
+    assert!(times == [0.25, 1.0, 4.0] && jpeg.factor == Some(4.0) && header("j").exposure == Some(0.125), "{said}");
+    // Steps in EV from the files' exposure biases are as relative.
+    for (i, bias) in [(-2, 1), (0, 1), (4, 2)].into_iter().enumerate() {
+        let notes = Notes { time: None, bias: Some(bias), ..Notes::default() };
+        photograph(&at(&format!("b{i}.jpg")), &scene, [0.25, 1.0, 4.0][i], Some(&notes));
+    }
+    let (_, times, said) = merge("b", "--sharp 1,2,3 b0.jpg b1.jpg b2.jpg");
+    assert!(times == [0.25, 1.0, 4.0] && said.contains("exposure biases") && header("b").exposure.is_none(), "{said}");
+    for (wrong, word) in [
+        ("--ev 0,2", "2 values for 3 frames"),
+        ("--ev 0,x,2", "\"x\""),
+        ("--ev 0,1,99", "such as -2"),
+        ("--ev 0,1,2 --exposures 1,2,3", "--exposures"),
+    ] {
+        let line = format!("merge -o w.exr {wrong} 0.png 1.png 2.png");
+        let (code, said) = unshaken(dir.path(), &line.split_whitespace().collect::<Vec<_>>());
+        assert!(code == Some(2) && said.contains("--ev") && said.contains(word), "{wrong}: {said}");
+    }
+}
+
+/// Luminances in cd/m², whichever frame is the reference; and what the result inherits of its notes.
+#[test]
+fn absolute_values_are_luminances() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let scene = scene(80, 60, 1.5);
+    let notes = Notes {
+        artist: Some("A. Person"),
+        copyright: Some("C. Person"),
+        lens: Some("Lens 35/2"),
+        taken: Some("2024:05:06 07:08:09"),
+        orientation: 6,
+        ..Notes::default()
+    };
+    for (name, time, light) in [("a.jpg", (1, 8), 0.25), ("b.jpg", (1, 2), 1.0), ("c.jpg", (2, 1), 4.0)] {
+        photograph(&at(name), &scene, light, Some(&Notes { time: Some(time), ..notes.clone() }));
+    }
+    let merge = |name: &str, line: &str| {
+        let line = format!("merge --no-align --sharp 1,2,3 --response gamma:2.2 -o {name}.exr {line} a.jpg b.jpg c.jpg");
+        let (code, said) = unshaken(dir.path(), &line.split_whitespace().collect::<Vec<_>>());
+        assert_eq!(code, Some(0), "{said}");
+        let own = ::exr::meta::MetaData::read_from_file(at(&format!("{name}.exr")), false).unwrap().headers[0].own_attributes.clone();
+        (exr::read_file(&at(&format!("{name}.exr"))).unwrap(), own, said)
+    };
+    let (relative, own, _) = merge("rel", "--preview rel.png");
+    // f/5.6, ISO 200, 2 s.
+    let white = 120.0 * 5.6 * 5.6 / (200.0 * 2.0);
+    assert!((own.white_luminance.unwrap() - white as f32).abs() < 1e-4 * white as f32, "{:?}", own.white_luminance);
+    let (absolute, own, said) = merge("abs", "--absolute --preview abs.jpg --report abs.json");
+    assert!(own.white_luminance == Some(1.0) && said.contains("cd/m2"), "{said}");
+    let comments = own.comments.unwrap().to_string();
+    assert!(comments.starts_with("value = luminance in cd/m2") && comments.contains("c.jpg (white 9.4080 cd/m2)"), "{comments}");
+    let off = largest_difference(&absolute.image, &relative.image, white as f32);
+    assert!(off < 1e-4, "off by {off}");
+    assert!((absolute.factor.unwrap() * white / relative.factor.unwrap() - 1.0).abs() < 1e-6, "irradiance is the same");
+    let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(at("abs.json")).unwrap()).unwrap();
+    assert!(report["colour"]["absolute"] == true && (report["colour"]["white_cd_m2"].as_f64().unwrap() - white).abs() < 1e-6);
+    // Another reference, another white, the same luminances.
+    let (other, own, _) = merge("other", "--absolute --reference 1");
+    let off = largest_difference(&other.image, &absolute.image, 1.0);
+    assert!(off < 0.02 && own.comments.unwrap().to_string().contains("a.jpg (white 150.5280"), "off by {off}");
+    // Both kinds of pictures say what the reference frame said, but for its geometry.
+    for name in ["rel.png", "abs.jpg"] {
+        let m = metadata::read(&at(name)).unwrap();
+        assert_eq!(
+            (m.artist.as_deref(), m.copyright.as_deref(), m.lens.as_deref()),
+            (Some("A. Person"), Some("C. Person"), Some("Lens 35/2"))
+        );
+        assert_eq!(
+            (m.taken.as_deref(), m.latitude, m.exposure_time, m.orientation),
+            (Some("2024:05:06 07:08:09"), Some(-33.5), Some(2.0), None)
+        );
+        assert_eq!(image::open(at(name)).unwrap().into_rgb8().dimensions(), (60, 80), "{name}");
+    }
+    assert_eq!(own_words(&at("rel.exr"), "lensModel").as_deref(), Some("Lens 35/2"));
+    // Without aperture and speed there is no telling.
+    for (name, time) in [("d.jpg", (1, 8)), ("e.jpg", (1, 2))] {
+        photograph(&at(name), &scene, 1.0, Some(&Notes { time: Some(time), f_number: None, iso: None, ..Notes::default() }));
+    }
+    let (code, said) = unshaken(dir.path(), &["merge", "-o", "x.exr", "--absolute", "d.jpg", "e.jpg"]);
+    assert!(code == Some(2) && said.contains("--absolute") && said.contains("d.jpg") && !at("x.exr").exists(), "{said}");
+}
+
+/// A text attribute of an OpenEXR file.
+fn own_words(path: &Path, name: &str) -> Option<String> {
+    let header = &::exr::meta::MetaData::read_from_file(path, false).unwrap().headers[0];
+    match header.own_attributes.other.get(&::exr::meta::attribute::Text::from(name))? {
+        ::exr::meta::attribute::AttributeValue::Text(t) => Some(t.to_string()),
+        _ => None,
+    }
+}
+
+/// The command alone: operators with parameters, an 8-bit picture that says that it is sRGB.
+#[test]
+fn tonemap_makes_pictures_as_told() {
+    use image::ImageDecoder;
+    let dir = tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let radiometry = Radiometry { exposure_time: 1.0, frame: "x".into() };
+    // In other primaries: red must still be red.
+    let style = Style { primaries: Primaries::Rec2020, ..Style::default() };
+    let mut image = colours(64, 48);
+    colour::convert(&mut image, &colour::product(&colour::inverse(&Primaries::Rec2020.to_xyz()).unwrap(), &Primaries::Rec709.to_xyz()));
+    Output::check(&at("a.exr"), true).unwrap().stage_linear(&image, &radiometry, &style).unwrap().0.commit().unwrap();
+    let tonemap = |name: &str, more: &[&str]| {
+        let (code, said) = unshaken(dir.path(), &[&["tonemap", "a.exr", "-o", name], more].concat());
+        assert_eq!(code, Some(0), "{said}");
+        (image::open(at(name)).unwrap(), said)
+    };
+    let mean = |p: &image::DynamicImage| p.to_rgb8().pixels().map(|p| f64::from(p.0[1])).sum::<f64>() / (64.0 * 48.0);
+    let (plain, _) = tonemap("plain.png", &[]);
+    assert_eq!((plain.color(), plain.width()), (image::ColorType::Rgb8, 64));
+    for name in unshaken::tonemap::Operator::names() {
+        let (same, _) = tonemap(&format!("{name}.png"), &["--tonemap", name]);
+        let (told, said) = tonemap(&format!("{name}-told.png"), &["--tonemap", &format!("{name}:exposure=1,saturation=0")]);
+        assert!(said.contains(name) && mean(&told) > mean(&same) + 8.0, "{said}");
+        assert!(told.to_rgb8().pixels().all(|p| p.0.iter().all(|v| v.abs_diff(p.0[1]) <= 1)), "{name}: no colour is left");
+        assert_eq!(name == "filmic", same == plain, "{name}");
+    }
+    tonemap("a.jpg", &["--quality", "90"]);
+    let png =
+        image::codecs::png::PngDecoder::new(std::io::BufReader::new(std::fs::File::open(at("plain.png")).unwrap())).unwrap().icc_profile();
+    let jpeg =
+        image::codecs::jpeg::JpegDecoder::new(std::io::BufReader::new(std::fs::File::open(at("a.jpg")).unwrap())).unwrap().icc_profile();
+    for profile in [png, jpeg] {
+        let profile = unshaken::io::icc::parse(&profile.unwrap().expect("a profile")).unwrap();
+        assert!(
+            profile.response == Response::Srgb && input::same_colours(&profile.to_xyz, &Primaries::Rec709.to_xyz()),
+            "{}",
+            profile.name
+        );
+    }
+    let (code, said) = unshaken(dir.path(), &["tonemap", "a.exr", "-o", "plain.png"]);
+    assert!(code == Some(1) && said.contains("--overwrite"), "{said}");
+    let (code, said) = unshaken(dir.path(), &["tonemap", "a.exr", "-o", "b.png", "--tonemap", "reinhard:phi=3"]);
+    assert!(code == Some(2) && said.contains("phi"), "{said}");
 }

@@ -14,6 +14,9 @@ pub struct Notes {
     pub taken: Option<&'static str>,
     pub orientation: u16,
     pub artist: Option<&'static str>,
+    pub copyright: Option<&'static str>,
+    pub lens: Option<&'static str>,
+    pub model: &'static str,
     /// NoiseProfile of a DNG file: pairs S, O.
     pub noise: Option<Vec<f64>>,
 }
@@ -28,6 +31,9 @@ impl Default for Notes {
             taken: None,
             orientation: 1,
             artist: None,
+            copyright: None,
+            lens: None,
+            model: "Model 1",
             noise: None,
         }
     }
@@ -39,7 +45,7 @@ impl Notes {
         let text = |t: &str| Value::Ascii(vec![t.as_bytes().to_vec()]);
         let mut all = vec![
             field(Tag::Make, text("Maker")),
-            field(Tag::Model, text("Model 1")),
+            field(Tag::Model, text(self.model)),
             field(Tag::Orientation, Value::Short(vec![self.orientation])),
             field(Tag::XResolution, Value::Rational(vec![Rational { num: 300, denom: 1 }])),
             field(Tag::PixelXDimension, Value::Long(vec![4321])),
@@ -53,6 +59,8 @@ impl Notes {
         all.extend(self.bias.map(|(num, denom)| field(Tag::ExposureBiasValue, Value::SRational(vec![SRational { num, denom }]))));
         all.extend(self.taken.map(|t| field(Tag::DateTimeOriginal, text(t))));
         all.extend(self.artist.map(|t| field(Tag::Artist, text(t))));
+        all.extend(self.copyright.map(|t| field(Tag::Copyright, text(t))));
+        all.extend(self.lens.map(|t| field(Tag::LensModel, text(t))));
         all
     }
 
