@@ -14,8 +14,8 @@ use crate::synth::Drawn;
 /// Width in pixels of the frames that features are counted in: those of the reconstruction are too small to have many.
 const LARGE: usize = 640;
 
-/// A sunlit window, as the paper's.
-const SCENE: Drawn = Drawn::Window;
+/// Writing in the light and in the shadow: every frame shows some of it.
+const SCENE: Drawn = Drawn::Chart;
 
 /// (first, second, matches, those that agree with the motion) of every pair of frames.
 fn matches(bracket: &Bracket, sharp: &[bool]) -> Vec<(usize, usize, usize, usize)> {
