@@ -1,30 +1,4 @@
 // warp_adjoint_near.wgsl for any homography: the targets of p lie within `reach` of round(H_b p).
-override SUPPORT: i32 = 2;
-
-struct Params {
-    size: vec2i,       // of the latent grid
-    in_size: vec2i,    // of one plane of the input
-    in_origin: vec2i,  // frame pixel of input pixel (0, 0)
-    pad: vec2i,        // latent pixel of frame pixel (0, 0)
-    centre: vec2f,     // of the frame, pixels
-    rows: vec2i,       // of the latent grid: the first one to compute, and the one after the last
-    out_first: i32,    // row of the latent grid that comes first in the binding
-    plane: u32,        // values from one base's plane of the input to the next; 0: all bases read the same
-    first_base: u32,
-    bases: u32,
-    reach: i32,
-    factor: f32,       // of everything that is added
-}
-
-@group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> bases: array<Base>;
-@group(0) @binding(2) var<storage, read> in_r: array<f32>;
-@group(0) @binding(3) var<storage, read> in_g: array<f32>;
-@group(0) @binding(4) var<storage, read> in_b: array<f32>;
-@group(0) @binding(5) var<storage, read_write> latent_r: array<f32>;
-@group(0) @binding(6) var<storage, read_write> latent_g: array<f32>;
-@group(0) @binding(7) var<storage, read_write> latent_b: array<f32>;
-
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u) {
     let p = vec2i(i32(id.x), i32(id.y) + params.rows.x);

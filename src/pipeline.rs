@@ -17,6 +17,7 @@ use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -473,20 +474,22 @@ impl Run<'_> {
         // Where no frame shows the scene: what to start from instead.
         let mut scene: Option<Rgb> = None;
         let mut centre: Option<usize> = None;
+        // Whether the TSFs of all frames come from a smaller size.
+        let mut reduced = false;
         let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
-        let doubtful =
-            given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto && blind::doubtful(&verdicts, &sharp);
+        let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
+        let doubted = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
             self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
-        } else if forced || doubtful || (!all_known && !sharp.contains(&true)) {
+        } else if forced || doubted.is_some() || (!all_known && !sharp.contains(&true)) {
             let (found, motions, blind, degraded) = self.remembered(
                 "all blurs",
                 "",
                 |_| 0,
                 |run| {
-                    let found = run.all_blurs(&used, doubtful, 0.03, 0.60)?;
+                    let found = run.all_blurs(&used, doubted.as_deref(), 0.03, 0.60)?;
                     Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
                 },
             )?;
@@ -495,12 +498,13 @@ impl Run<'_> {
                 Some(found) => {
                     scene = Some(found.start);
                     centre = Some(found.reference);
+                    reduced = found.reduced;
                     for (&i, tsf) in used.iter().zip(found.tsfs) {
                         sharp[i] = false;
                         tsfs[i] = Some(tsf);
                     }
                 }
-                None => unexplained = !doubtful,
+                None => unexplained = doubted.is_none(),
             }
         } else if !sharp.contains(&true) {
             scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);
@@ -545,8 +549,13 @@ impl Run<'_> {
         let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
-        let base = self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
-        let mut latent = scene.clone().unwrap_or_else(|| base.cropped());
+        let base = match &scene {
+            Some(_) => None,
+            None => {
+                Some(self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?)
+            }
+        };
+        let mut latent = base.as_ref().map(Solution::cropped).or(scene.clone()).unwrap_or(initial.clone());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
@@ -566,6 +575,7 @@ impl Run<'_> {
         let mut all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
         let start = latent.clone();
         let mut solution = None;
+        let estimated = if reduced { shaken.clone() } else { estimated };
         let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
         let mut round = 0;
         while round < rounds && !shaken.is_empty() {
@@ -579,12 +589,9 @@ impl Run<'_> {
             }
             let known: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
             let pad = deblur::pad_for(&known, w, h, limit);
-            let from = match (&solution, &scene) {
-                (None, Some(scene)) => self.surrounded(scene, 0, pad, &still, &shaken),
-                (found, _) => {
-                    let found = found.as_ref().unwrap_or(&base);
-                    self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken)
-                }
+            let from = match solution.as_ref().or(base.as_ref()) {
+                Some(found) => self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken),
+                None => self.surrounded(&latent, 0, pad, &still, &shaken),
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
@@ -619,13 +626,12 @@ impl Run<'_> {
             }
             solution = None;
         }
-        let solution = match solution {
+        let solution = match solution.or(base.filter(|_| shaken.is_empty() && first == alone)) {
             Some(found) => found,
             // No shaken frame is left: the sharp ones alone, as the user wants them.
-            None if first != alone => {
+            None => {
                 self.solved("sharp frames", "alone", &alone, |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.90, 0.98))?
             }
-            None => base,
         };
         self.progress("finishing", 0.99)?;
         self.finish(solution, reference, &verdicts, &sharp, &all, &tsfs, details)
@@ -670,17 +676,28 @@ impl Run<'_> {
         Ok(solved)
     }
 
+    /// Exposures and masks of the frames `ids` as registration places them, on the reference's grid plus `pad` pixels on every side; of
+    /// the others as they are. Nothing is copied where nothing moves.
+    fn placed<'m>(&'m self, ids: &[usize], masks: &'m [Plane], pad: usize) -> (Cow<'m, [Rgb]>, Cow<'m, [Plane]>) {
+        let moves = |i: usize| pad > 0 || self.motions[i] != DMat3::IDENTITY;
+        if !ids.iter().any(|&i| moves(i)) {
+            return (Cow::Borrowed(&self.exposures), Cow::Borrowed(masks));
+        }
+        let placed = (0..masks.len()).map(|i| {
+            if ids.contains(&i) && moves(i) {
+                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], pad)
+            } else {
+                (self.exposures[i].clone(), masks[i].clone())
+            }
+        });
+        let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = placed.unzip();
+        (Cow::Owned(exposures), Cow::Owned(masks))
+    }
+
     /// Merge of the frames `ids`, placed but not deblurred, on the reference's grid plus `pad` pixels on every side, and where any of
     /// them is not masked.
     fn start(&self, ids: &[usize], pad: usize) -> (Rgb, Plane) {
-        let seen = (0..self.exposures.len()).map(|i| {
-            if ids.contains(&i) && (pad > 0 || self.motions[i] != DMat3::IDENTITY) {
-                merge::resampled(&self.exposures[i], &self.masks[i], &self.motions[i], pad)
-            } else {
-                (self.exposures[i].clone(), self.masks[i].clone())
-            }
-        });
-        let (exposures, masks): (Vec<Rgb>, Vec<Plane>) = seen.unzip();
+        let (exposures, masks) = self.placed(ids, &self.masks, pad);
         let merged = merge::irradiance(self.bracket, &exposures, &masks, &self.curves, ids);
         let (w, h) = merged.size();
         (merged, Plane::from_fn(w, h, |x, y| ids.iter().map(|&i| masks[i].data[y * w + x]).fold(0.0, f32::max)))

@@ -4,7 +4,7 @@ use super::luminance::{self, Effort, Frame, chi_squared, operators};
 use crate::image::Plane;
 use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
-use crate::tsf::{Tsf, WholeFrame};
+use crate::tsf::{self, Tsf, WholeFrame};
 use glam::DMat3;
 use rayon::prelude::*;
 
@@ -22,10 +22,10 @@ pub struct Stage {
 pub struct Joint {
     /// One TSF per frame; the mean pose of the reference frame is the identity.
     pub tsfs: Vec<Tsf>,
-    /// Latent luminance (irradiance) on the frame's grid plus `pad` on every side.
+    /// Latent luminance (irradiance) on the frame's grid.
     pub luminance: Plane,
-    /// Pad in pixels.
-    pub pad: usize,
+    /// Pixels of the frame per pixel of the finest level that was worked on, per axis.
+    pub scale: usize,
     /// Frame whose mean pose is the identity.
     pub reference: usize,
     /// Mean squared residual over noise variance of each frame on pixels that no part of the estimate has seen.
@@ -47,6 +47,8 @@ pub struct Start {
 const COARSEST: usize = 250;
 /// Rounds of luminance and TSFs at the coarsest level and at finer ones.
 const ROUNDS: (usize, usize) = (12, 5);
+/// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
+const LARGEST: usize = 500_000;
 /// Rounds after which the better start is chosen. After two, a start from a more blurred frame, which it explains by standing still, may lead.
 const TRIAL: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
@@ -82,6 +84,11 @@ pub fn shrink(frame: &Frame, scale: usize) -> Frame {
         clipped: (0..w * h).map(|p| (0..4).all(|k| frame.clipped[(p / w * 2 + k / 2) * frame.blurred.width + p % w * 2 + k % 2])).collect(),
     };
     shrink(&half, scale / 2)
+}
+
+/// `plane` at 1/`scale` (a power of two) of its size.
+fn shrunk(plane: &Plane, scale: usize) -> Plane {
+    if scale == 1 { plane.clone() } else { shrunk(&halve(plane), scale / 2) }
 }
 
 /// Half the size through the binomial filter [1 3 3 1]/8: means over squares let through what the coarser grid cannot hold, and no warp is
@@ -156,6 +163,8 @@ struct Level {
     size: (usize, usize),
     pad: usize,
     grid: PoseGrid,
+    /// Whether a coarser level told where the poses are: they are looked for near there alone.
+    near: bool,
     /// Pixels that count for TSFs and for the judgement.
     known: Vec<bool>,
     held: Vec<bool>,
@@ -170,7 +179,7 @@ struct State {
 }
 
 impl Level {
-    fn new(frames: &[Frame], scale: usize) -> Self {
+    fn new(frames: &[Frame], scale: usize, near: bool) -> Self {
         let longer = frames[0].blurred.width.max(frames[0].blurred.height);
         let frames: Vec<Frame> = frames.iter().map(|f| shrink(f, scale)).collect();
         let size = frames[0].blurred.size();
@@ -179,15 +188,12 @@ impl Level {
         let known = known(&frames, 10 / scale + 1);
         // A fixed scatter over rows and columns.
         let held = (0..size.0 * size.1).map(|p| (p % size.0 * 12 + p / size.0 * 5).is_multiple_of(HELD)).collect();
-        Self { scale, pad: radius + 6, frames, size, grid, known, held }
+        Self { scale, pad: radius + 6, frames, size, grid, near, known, held }
     }
 
     /// The start explains its frame; the other TSFs follow from it.
     fn begin(&self, start: &Start) -> State {
-        let whole = start.luminance.map(|_| 1.0);
-        let start_frame =
-            Frame { blurred: start.luminance.clone(), variance: whole.clone(), clipped: vec![false; whole.data.len()], mask: whole };
-        let latent = shrink(&start_frame, self.scale).blurred.padded(self.pad);
+        let latent = shrunk(&start.luminance, self.scale).padded(self.pad);
         let mut tsfs: Vec<Tsf> =
             self.frames.par_iter().map(|f| self.fit(f, &latent, None, MODEL_ERROR.0).unwrap_or_else(Tsf::identity)).collect();
         tsfs[start.reference] = Tsf { focal_px: tsfs[start.reference].focal_px, ..Tsf::identity() };
@@ -225,7 +231,10 @@ impl Level {
         let weight = Plane { data: (0..local.data.len()).map(weight).collect(), ..local };
         let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
         // Faint poses are the fit's answer to noise and to what the luminance still lacks; unchecked, they widen the TSF round by round.
-        let rough = whole.fit_grid(&self.grid, start)?;
+        let rough = match start {
+            Some(start) if self.near => whole.fit_around(start)?,
+            _ => whole.fit_grid(&self.grid, start)?,
+        };
         without_faint(&whole.refine(&rough))
     }
 
@@ -236,22 +245,27 @@ impl Level {
         self.frames.iter().zip(&operators).map(|(f, o)| chi_squared(f, o, &state.latent, &chosen)).collect()
     }
 
-    /// `state` of a level at `scale`.
+    /// `state` of the coarser level `from`.
     fn refine(&self, state: State, from: &Level) -> State {
-        let ratio = (from.scale / self.scale) as f64;
-        let at = |v: usize| (v as f64 - self.pad as f64 + 0.5) / ratio - 0.5 + from.pad as f64;
-        let (w, h) = (self.size.0 + 2 * self.pad, self.size.1 + 2 * self.pad);
+        let ratio = from.scale / self.scale;
         State {
             reference: state.reference,
-            latent: Plane::from_fn(w, h, |x, y| sample(&state.latent, at(x), at(y))),
-            tsfs: state.tsfs.iter().map(|t| spread(t, ratio)).collect(),
+            latent: from.enlarged(&state.latent, ratio, self.size, self.pad),
+            tsfs: state.tsfs.iter().map(|t| spread(t, ratio as f64)).collect(),
         }
+    }
+
+    /// `latent` of this level on a grid of `size` plus `pad` pixels on every side, `ratio` of them to one of its own.
+    fn enlarged(&self, latent: &Plane, ratio: usize, size: (usize, usize), pad: usize) -> Plane {
+        let at = |v: usize| (v as f64 - pad as f64 + 0.5) / ratio as f64 - 0.5 + self.pad as f64;
+        Plane::from_fn(size.0 + 2 * pad, size.1 + 2 * pad, |x, y| sample(latent, at(x), at(y)))
     }
 }
 
-/// Sum of the logarithms: no frame buys its fit with another's.
-fn loss(chi: &[f64]) -> f64 {
-    chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).sum()
+/// exp of the mean logarithm: no frame buys its fit with another's.
+pub fn geometric_mean(chi: &[f64]) -> f64 {
+    let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
+    if logs.is_empty() { f64::INFINITY } else { (logs.iter().sum::<f64>() / logs.len() as f64).exp() }
 }
 
 /// Value at part `t` of the way from `range.0` to `range.1`, geometrically.
@@ -259,38 +273,29 @@ fn between(range: (f32, f32), t: f32) -> f32 {
     range.0 * (range.1 / range.0).powf(t)
 }
 
-/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with:
-/// a merge, unblurred, and where each frame lies. `progress` returning `false` ends the work: `None`, as for no start.
-pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
+/// The level at which a blur is a few pixels long: pixels of the frame per pixel of it.
+fn coarsest(frames: &[Frame]) -> usize {
     let longer = frames[0].blurred.width.max(frames[0].blurred.height);
     let mut scale = 1;
     while longer / scale > COARSEST {
         scale *= 2;
     }
-    let mut total = 0.0;
-    let mut s = scale;
-    while s >= 1 {
-        let rounds = if s == scale { ROUNDS.0 + TRIAL * (starts.len() - 1) } else { ROUNDS.1 };
-        total += rounds as f32 / (s * s) as f32;
-        s /= 2;
-    }
-    let mut done = 0.0;
-    let mut advance = |scale: usize| {
-        done += 1.0 / (scale * scale) as f32;
-        progress(Stage { scale, fraction: done / total })
-    };
+    scale
+}
 
-    let mut level = Level::new(frames, scale);
+/// Luminance and TSFs at the coarsest `level`: from the best of `starts`, smoothness and trust in the operators falling. `None` when `going`
+/// returns `false`, which it is asked after each round.
+fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best: Option<(f64, State)> = None;
     for start in starts {
         let mut state = level.begin(start);
         for _ in 0..TRIAL {
             level.round(&mut state, SMOOTHNESS.0, MODEL_ERROR.0);
-            if !advance(scale) {
+            if !going() {
                 return None;
             }
         }
-        let value = loss(&level.judge(&state));
+        let value = geometric_mean(&level.judge(&state));
         if best.as_ref().is_none_or(|b| value < b.0) {
             best = Some((value, state));
         }
@@ -299,19 +304,63 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     for k in TRIAL..ROUNDS.0 {
         let t = (k + 1 - TRIAL) as f32 / (ROUNDS.0 - TRIAL) as f32;
         level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t));
-        if !advance(scale) {
+        if !going() {
             return None;
         }
     }
-    while scale > 1 {
-        scale /= 2;
-        let finer = Level::new(frames, scale);
+    Some(state)
+}
+
+/// Rounds at the coarsest level from so many starts.
+fn coarse_rounds(starts: usize) -> usize {
+    ROUNDS.0 + TRIAL * (starts - 1)
+}
+
+/// Extent of each frame's blur in pixels as the coarsest level tells it, for frames of a few hundred pixels: enough to know which of them
+/// stood still. `None` as for [`estimate`].
+pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Vec<f64>> {
+    let scale = coarsest(frames);
+    let (mut done, total) = (0, coarse_rounds(starts.len()));
+    let level = Level::new(frames, scale, false);
+    let state = at_coarsest(&level, starts, &mut || {
+        done += 1;
+        progress(Stage { scale, fraction: done as f32 / total as f32 })
+    })?;
+    Some(state.tsfs.iter().map(|t| scale as f64 * tsf::extent(t, level.size.0, level.size.1)).collect())
+}
+
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with:
+/// a merge, unblurred, and where each frame lies. `progress` returning `false` ends the work: `None`, as for no start.
+pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
+    let (w, h) = frames[0].blurred.size();
+    let first = coarsest(frames);
+    let mut last = 1;
+    while w * h / (last * last) > LARGEST && last < first {
+        last *= 2;
+    }
+    let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
+    let mut total = cost(first, coarse_rounds(starts.len()));
+    let mut s = first;
+    while s > last {
+        s /= 2;
+        total += cost(s, ROUNDS.1);
+    }
+    let mut done = 0.0;
+    let mut advance = |scale: usize| {
+        done += cost(scale, 1);
+        progress(Stage { scale, fraction: done / total })
+    };
+
+    let mut level = Level::new(frames, first, false);
+    let mut state = at_coarsest(&level, starts, &mut || advance(first))?;
+    while level.scale > last {
+        let finer = Level::new(frames, level.scale / 2, true);
         state = finer.refine(state, &level);
         level = finer;
         for k in 0..ROUNDS.1 {
             let t = k as f32 / (ROUNDS.1 - 1) as f32;
             level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t));
-            if !advance(scale) {
+            if !advance(level.scale) {
                 return None;
             }
         }
@@ -319,8 +368,19 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     level.solve(&mut state, 1.0, MODEL_ERROR.1, 3);
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
-    let mut still = State { reference: state.reference, latent: merged.0.padded(level.pad), tsfs: merged.1.to_vec() };
+    let mut still = State {
+        reference: state.reference,
+        latent: shrunk(merged.0, last).padded(level.pad),
+        tsfs: merged.1.iter().map(|t| t.scaled(1.0 / last as f64)).collect(),
+    };
     level.solve(&mut still, 1.0, MODEL_ERROR.1, 3);
     let held_out_merge = level.judge(&still);
-    Some(Joint { tsfs: state.tsfs, luminance: state.latent, pad: level.pad, reference: state.reference, held_out, held_out_merge })
+    Some(Joint {
+        luminance: level.enlarged(&state.latent, last, (w, h), 0),
+        tsfs: state.tsfs.iter().map(|t| tsf::filled(t, last as f64)).collect(),
+        scale: last,
+        reference: state.reference,
+        held_out,
+        held_out_merge,
+    })
 }

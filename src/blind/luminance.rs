@@ -218,6 +218,20 @@ impl Frame {
     }
 }
 
+impl Frame {
+    /// The part of `size` pixels whose first is `at`.
+    ///
+    /// # Panics
+    /// Where that reaches beyond the frame.
+    #[must_use]
+    pub fn crop(&self, at: (usize, usize), size: (usize, usize)) -> Self {
+        let w = self.blurred.width;
+        let part = |p: &Plane| p.crop(at.0, at.1, size.0, size.1);
+        let clipped = (0..size.0 * size.1).map(|p| self.clipped[(at.1 + p / size.0) * w + at.0 + p % size.0]).collect();
+        Self { blurred: part(&self.blurred), variance: part(&self.variance), mask: part(&self.mask), clipped }
+    }
+}
+
 /// Latent luminance of `frames` under `tsfs` that are known, on the frame's grid plus `pad`, started at `merged` (frame's grid).
 pub fn luminance_of(frames: &[Frame], tsfs: &[Tsf], merged: &Plane, pad: usize) -> Plane {
     let operators = operators(tsfs, merged.size(), pad);

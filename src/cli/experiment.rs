@@ -18,7 +18,7 @@ pub(super) struct ExperimentArgs {
     #[arg(long, value_name = "DIR")]
     pub output_dir: PathBuf,
     /// Width of the frames in pixels; their height is three quarters of it
-    #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(160..=2048))]
+    #[arg(long, value_name = "PX", default_value_t = 192, value_parser = clap::value_parser!(u32).range(160..=2048))]
     pub width: u32,
     /// Seed of scenes, shake and noise
     #[arg(long, value_name = "N", default_value_t = 1)]

@@ -142,14 +142,6 @@ pub struct Solution {
 }
 
 impl Solution {
-    /// Irradiance on the frame's grid plus `pad` pixels on every side; beyond what was solved for, that of the nearest pixel.
-    pub fn with_pad(&self, pad: usize) -> Rgb {
-        let (w, h) = self.irradiance.size();
-        let own = self.pad as isize - pad as isize;
-        let (w, h) = (w - 2 * self.pad + 2 * pad, h - 2 * self.pad + 2 * pad);
-        self.irradiance.map_planes(|p| Plane::from_fn(w, h, |x, y| p.clamped(x as isize + own, y as isize + own)))
-    }
-
     /// Irradiance on the frame's grid alone.
     pub fn cropped(&self) -> Rgb {
         let (w, h) = self.irradiance.size();

@@ -1,6 +1,6 @@
 //! Footnote 1: how accurate TSFs found from PSFs are.
 
-use super::local::{self, RADIUS, centre, true_psf};
+use super::local::{self, RADIUS};
 use super::study::{Events, Exposures, Shaking, seconds};
 use super::{Lab, Report, sheet};
 use crate::error::Result;
@@ -8,7 +8,7 @@ use crate::image::{Plane, Rgb};
 use crate::pose::PoseGrid;
 use crate::psf::{Patch, Psf};
 use crate::synth::{self, Drawn};
-use crate::tsf::{self, Tsf};
+use crate::tsf::{self, Tsf, psf_at};
 
 /// ‖K̂E - KE‖ / ‖KE‖ over all channels, inside a margin that nothing from beyond the frame reaches.
 fn operator_error(estimated: &Rgb, truth: &Rgb) -> f64 {
@@ -41,10 +41,7 @@ pub(super) fn run(lab: &mut Lab, events: Events) -> Result<Report> {
             let truth = synth::integrate(&study.scene, &study.motions[i].homographies());
             let of = |tsf: &Tsf| operator_error(&synth::expose(&study.scene, tsf), &truth);
             let psfs = local::measured(study, i, events)?;
-            let exact: Vec<(Patch, Psf)> = psfs
-                .iter()
-                .map(|(p, _)| (*p, Psf { radius: RADIUS, values: true_psf(&study.made.tsfs[i], centre(p, (w, h)), RADIUS) }))
-                .collect();
+            let exact: Vec<(Patch, Psf)> = psfs.iter().map(|(p, _)| (*p, psf_at(&study.made.tsfs[i], p.centred((w, h)), RADIUS))).collect();
             let (from_true, from_found) = (tsf::from_psfs(&exact, &grid, w, h), tsf::from_psfs(&psfs, &grid, w, h));
             let told = |tsf: &Option<Tsf>| tsf.as_ref().map_or("none".into(), |t| format!("{:.1} %", 100.0 * of(t)));
             let whole = &study.joint.tsfs[i];

@@ -7,11 +7,8 @@ use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::merge::gradient_level;
 use crate::noise;
-use crate::pose::project;
 use crate::psf::{self, Patch, Psf};
 use crate::response::Response;
-use crate::tsf::Tsf;
-use glam::DVec2;
 
 /// Patches per frame.
 const PATCHES: usize = 9;
@@ -21,31 +18,6 @@ const SIZE: usize = 96;
 pub(super) const RADIUS: usize = 15;
 /// Standard deviation of the blur model's own error, as a part of the mean absolute gradient around a pixel.
 const MODEL_ERROR: f32 = 0.03;
-
-/// True PSF at `p` (centred pixels) by eq. (5): each pose's weight at p - Γ⁻¹ p, split bilinearly.
-pub(super) fn true_psf(tsf: &Tsf, p: DVec2, radius: usize) -> Plane {
-    let side = 2 * radius + 1;
-    let mut psf = Plane::filled(side, side, 0.0);
-    for pose in &tsf.poses {
-        let u = p - project(&(pose.homography(tsf.focal_px) * tsf.base).inverse(), p);
-        let (fx, fy) = (u.x.floor(), u.y.floor());
-        for (j, wy) in [(0.0, 1.0 - (u.y - fy)), (1.0, u.y - fy)] {
-            for (i, wx) in [(0.0, 1.0 - (u.x - fx)), (1.0, u.x - fx)] {
-                let (x, y) = (fx + i + radius as f64, fy + j + radius as f64);
-                if x >= 0.0 && y >= 0.0 && x < side as f64 && y < side as f64 {
-                    psf.data[y as usize * side + x as usize] += (pose.weight * wx * wy) as f32;
-                }
-            }
-        }
-    }
-    psf
-}
-
-/// Centre of `patch` on a `width` x `height` frame, centred pixels.
-pub(super) fn centre(patch: &Patch, (width, height): (usize, usize)) -> DVec2 {
-    let (x, y) = patch.centre();
-    DVec2::new(x - 0.5 * (width as f64 - 1.0), y - 0.5 * (height as f64 - 1.0))
-}
 
 /// Irradiance of frame `i` (mean of the channels) and its inverse variance, 0 where it is clipped. `latent`: the scene as far as it is known.
 pub(super) fn seen(bracket: &Bracket, response: &Response, i: usize, latent: &Plane) -> (Plane, Plane) {

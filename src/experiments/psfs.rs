@@ -1,6 +1,6 @@
 //! Figures 3 and 4: patches of shaken frames, the true PSF of each and the estimated one.
 
-use super::local::{self, RADIUS, centre, error, median, smoothed, true_psf};
+use super::local::{self, RADIUS, error, median, smoothed};
 use super::study::{Events, Exposures, Shaking, Study, seconds};
 use super::{Lab, Report, sheet};
 use crate::error::{Error, Result};
@@ -11,6 +11,7 @@ use crate::psf::{self, Patch, Psf};
 use crate::response::Response;
 use crate::synth::Drawn;
 use crate::tonemap::codes;
+use crate::tsf::psf_at;
 use glam::DVec2;
 use image::{RgbImage, imageops};
 
@@ -30,9 +31,9 @@ pub(super) fn run(lab: &mut Lab, events: Events) -> Result<Report> {
         let mut strips: [Vec<(String, RgbImage)>; 4] = Default::default();
         for (k, (patch, psf)) in local::measured(study, i, events)?.into_iter().enumerate() {
             let (x, y, side) = (patch.x, patch.y, patch.size);
-            let at = centre(&patch, size);
-            let truth = true_psf(&study.made.tsfs[i], at, RADIUS);
-            let by_tsf = true_psf(&study.joint.tsfs[i], at, RADIUS);
+            let at = patch.centred(size);
+            let truth = psf_at(&study.made.tsfs[i], at, RADIUS).values;
+            let by_tsf = psf_at(&study.joint.tsfs[i], at, RADIUS).values;
             let of = |p: &Plane| (error(p, &truth), error(&smoothed(p), &smoothed(&truth)));
             let (direct, global) = (of(&psf.values), of(&by_tsf));
             let wide = Psf { radius: RADIUS, values: truth.clone() }.extent();
@@ -103,8 +104,8 @@ pub(super) fn blind(lab: &mut Lab, events: Events) -> Result<Report> {
         }
         let cut = |p: &Plane| p.crop(patch.x, patch.y, side, side);
         let Some(found) = psf::estimate_pair(&cut(&first.0), &cut(&second.0), [&cut(&first.1), &cut(&second.1)], &setup) else { continue };
-        let at = centre(patch, (w, h));
-        let truth = pair.map(|i| true_psf(&made.tsfs[i], at, RADIUS));
+        let at = patch.centred((w, h));
+        let truth = pair.map(|i| psf_at(&made.tsfs[i], at, RADIUS).values);
         let estimated = aligned(&found.psfs.each_ref().map(|h| &h.values), &truth);
         let point = Plane::from_fn(2 * RADIUS + 1, 2 * RADIUS + 1, |x, y| if (x, y) == (RADIUS, RADIUS) { 1.0 } else { 0.0 });
         let points = aligned(&[&point, &point], &truth);

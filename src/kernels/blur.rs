@@ -24,11 +24,13 @@ pub(super) const WARP: &str = concat!(
 pub(super) const WARP_ADJOINT: &str = concat!(
     include_str!("../../shaders/common/plane.wgsl"),
     include_str!("../../shaders/common/pose.wgsl"),
+    include_str!("../../shaders/common/adjoint.wgsl"),
     include_str!("../../shaders/warp_adjoint.wgsl")
 );
 pub(super) const WARP_ADJOINT_NEAR: &str = concat!(
     include_str!("../../shaders/common/plane.wgsl"),
     include_str!("../../shaders/common/pose.wgsl"),
+    include_str!("../../shaders/common/adjoint.wgsl"),
     include_str!("../../shaders/warp_adjoint_near.wgsl")
 );
 pub(super) const TAP_SUM: &str = include_str!("../../shaders/tap_sum.wgsl");

@@ -7,24 +7,24 @@ use crate::error::{Error, Result};
 use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::merge;
-use crate::psf::{Patch, Psf};
+use crate::pose::project;
+use crate::psf::{self, Patch, Psf};
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
-use glam::DMat3;
+use glam::DVec2;
 use serde_json::{Value, json};
 
 /// What is done when no frame is sharp.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Blind {
-    /// [`Blind::Joint`] when no frame is sharp, and when none is surely sharp and the estimate finds that even the reference frame moved.
+    /// [`Blind::Joint`] when no frame is sharp, and when none is surely sharp and the estimate finds that all of them moved.
+    #[default]
     Auto,
     /// Irradiance and the TSFs of all frames together, whatever the triage says of the frames.
     Joint,
     /// The paper's path (section III-B), whatever the triage says of the frames: PSFs of pairs of patches, aligned; TSFs from them.
     Patches,
-    /// The frames are merged without deblurring when none is sharp: the default, while the joint estimate takes minutes and is not yet
-    /// shown to gain on every bracket.
-    #[default]
+    /// The frames are merged without deblurring when none is sharp.
     Off,
 }
 
@@ -34,6 +34,8 @@ pub(super) struct Found {
     pub start: Rgb,
     pub tsfs: Vec<Tsf>,
     pub reference: usize,
+    /// Whether the TSFs were estimated at a smaller size than the frame's.
+    pub reduced: bool,
 }
 
 /// Held-out χ² of the joint estimate over that of the merge below which it is believed.
@@ -49,38 +51,33 @@ const SURELY_STEEP: f64 = 0.57;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
 
-/// Whether frames pass for sharp, but none surely.
-pub(super) fn doubtful(verdicts: &[Verdict], sharp: &[bool]) -> bool {
-    let steepest = verdicts.iter().zip(sharp).filter(|(_, s)| **s).map(|(v, _)| v.steepness).fold(f64::NEG_INFINITY, f64::max);
-    steepest.is_finite() && steepest < SURELY_STEEP
-}
+/// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
+/// pixels long, whatever the frame's size.
+const WINDOW: (usize, usize) = (360, 240);
+/// Least side of it.
+const LEAST_WINDOW: usize = 96;
+/// Displacement in pixels of a frame's window that the search covers.
+const DISPLACED: f64 = 4.0;
 
-/// exp of the mean logarithm: no frame buys its fit with another's.
-fn geometric_mean(chi: &[f64]) -> f64 {
-    let logs: Vec<f64> = chi.iter().filter(|c| c.is_finite()).map(|c| c.max(1e-6).ln()).collect();
-    if logs.is_empty() { f64::INFINITY } else { (logs.iter().sum::<f64>() / logs.len() as f64).exp() }
+/// The frames to look at where frames pass for sharp, but none surely: those, and one more where it is a single one.
+pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> Option<Vec<usize>> {
+    let (mut passing, mut others): (Vec<usize>, Vec<usize>) = used.iter().partition(|&&i| sharp[i]);
+    if passing.is_empty() || passing.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
+        return None;
+    }
+    others.sort_by(|&a, &b| verdicts[b].steepness.total_cmp(&verdicts[a].steepness));
+    passing.extend(others.first().filter(|_| passing.len() == 1));
+    (passing.len() > 1).then_some(passing)
 }
 
 impl Run<'_> {
     fn luminances(&self, used: &[usize]) -> (Vec<Frame>, Rgb) {
         let frames = self.bracket.frames();
         let masks = mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions);
-        let (aligned, seen) = self.aligned(used, &masks);
+        let (aligned, seen) = self.placed(used, &masks, 0);
         let merged = merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used);
         let frame = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], frames[i].exposure_time);
         (used.iter().map(frame).collect(), merged)
-    }
-
-    /// Exposures and masks of the frames `used` as registration places them.
-    fn aligned(&self, used: &[usize], masks: &[Plane]) -> (Vec<Rgb>, Vec<Plane>) {
-        let seen = (0..masks.len()).map(|i| {
-            if used.contains(&i) && self.motions[i] != DMat3::IDENTITY {
-                merge::resampled(&self.exposures[i], &masks[i], &self.motions[i], 0)
-            } else {
-                (self.exposures[i].clone(), masks[i].clone())
-            }
-        });
-        seen.unzip()
     }
 
     /// `luminance` in the colours of `merged`: those of a blurred merge, but they change less across an edge than the luminance does.
@@ -105,9 +102,85 @@ impl Run<'_> {
     }
 
     /// The TSFs of all of the frames `used` and a scene to start from; `None` when a merge explains them as well or, where the triage was
-    /// in doubt (`doubtful`), the reference frame hardly moved. Progress runs from `from` to `to`.
-    pub(super) fn all_blurs(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
-        if self.settings.blind == Blind::Patches { self.patches(used, from, to) } else { self.joint(used, doubtful, from, to) }
+    /// in doubt about the frames `doubted`, one of them hardly moved. Progress runs from `from` to `to`.
+    pub(super) fn all_blurs(&mut self, used: &[usize], doubted: Option<&[usize]>, from: f32, to: f32) -> Result<Option<Found>> {
+        if self.settings.blind == Blind::Patches {
+            return self.patches(used, from, to);
+        }
+        let Some(doubted) = doubted else { return self.joint(used, false, from, to) };
+        let at = from + 0.3 * (to - from);
+        if self.all_moved(doubted, from, at)? { self.joint(used, true, at, to) } else { Ok(None) }
+    }
+
+    /// Frame of `used` to start from, and the next best: the shortest are nearly always the least blurred.
+    fn starts(&self, used: &[usize]) -> Vec<Start> {
+        let time = |k: usize| self.bracket.frames()[used[k]].exposure_time;
+        let mut order: Vec<usize> = (0..used.len()).collect();
+        order.sort_by(|&a, &b| time(a).total_cmp(&time(b)));
+        if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
+            order = vec![r];
+        }
+        let alone = |k: usize| merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]).mean();
+        order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
+    }
+
+    /// Whether every one of `frames`, which pass for sharp, moved while it was exposed: the joint estimate of a part of the frame with much
+    /// texture, at its coarsest level.
+    fn all_moved(&mut self, frames: &[usize], from: f32, to: f32) -> Result<bool> {
+        let (w, h) = self.bracket.size();
+        let whole = self.luminances(frames).0;
+        // Where each frame's window lies, from the reference's: to the pixel.
+        let shift = |i: usize, c: DVec2| (project(&self.motions[i], c) - c).round();
+        let corner = DVec2::new(0.5 * w as f64, 0.5 * h as f64);
+        let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(x, y)| DVec2::new(x, y) * corner);
+        let most = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
+        let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
+        let (rw, rh) = (room(w, most.x), room(h, most.y));
+        let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
+        let (ww, wh) = (longest(rw, rh), longest(rh, rw));
+        if ww.min(wh) < LEAST_WINDOW {
+            return Ok(false);
+        }
+        let (mx, my) = (most.x as usize, most.y as usize);
+        let first = &whole[0];
+        let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
+        let seen = |p: &Plane| p.crop(mx, my, rw, rh);
+        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(false) };
+        let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
+        let centre = DVec2::new((x + ww / 2) as f64, (y + wh / 2) as f64) - corner;
+        let turned = |i: usize| {
+            let s = shift(i, centre);
+            [(-1.0, -1.0), (1.0, 1.0)].iter().any(|&(a, b)| {
+                let c = centre + 0.5 * DVec2::new(a * ww as f64, b * wh as f64);
+                (shift(i, c) - s).abs().max_element() > DISPLACED
+            })
+        };
+        if frames.iter().any(|&i| turned(i)) {
+            return Ok(false);
+        }
+        let at = |i: usize| {
+            let s = shift(i, centre);
+            ((x as f64 + s.x) as usize, (y as f64 + s.y) as usize)
+        };
+        let cut: Vec<Frame> = frames.iter().zip(&whole).map(|(&i, f)| f.crop(at(i), (ww, wh))).collect();
+        let starts: Vec<Start> = self
+            .starts(frames)
+            .into_iter()
+            .map(|s| {
+                let (x, y) = at(frames[s.reference]);
+                Start { luminance: s.luminance.crop(x, y, ww, wh), ..s }
+            })
+            .collect();
+        let events = &mut self.events;
+        let extents = blind::coarse_extents(&cut, &starts, &mut |s| {
+            let stage = "no frame is surely sharp: looking whether all moved".into();
+            events(Event::Progress { stage, fraction: from + (to - from) * s.fraction })
+        })
+        .ok_or(Error::Cancelled)?;
+        let all = extents.iter().all(|e| *e > SHAKEN);
+        let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
+        self.blind = json!({ "method": "joint", "believed": false, "in_doubt": names, "window_px": [x, y, ww, wh], "extent_px": extents });
+        Ok(all)
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
@@ -151,27 +224,14 @@ impl Run<'_> {
             tsfs[i] = Some(tsf.clone());
         }
         let start = self.start_from_tsfs(used, &tsfs)?;
-        Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference] }))
+        Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference], reduced: false }))
     }
 
     /// The joint estimate.
     fn joint(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
         let (frames, merged) = self.luminances(used);
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
-        // The shortest frame is nearly always the least blurred.
-        let mut order: Vec<usize> = (0..used.len()).collect();
-        order.sort_by(|&a, &b| self.bracket.frames()[used[a]].exposure_time.total_cmp(&self.bracket.frames()[used[b]].exposure_time));
-        if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
-            order = vec![r];
-        }
-        let starts: Vec<Start> = order
-            .iter()
-            .take(2)
-            .map(|&k| {
-                let alone = merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]);
-                Start { reference: k, luminance: alone.mean() }
-            })
-            .collect();
+        let starts = self.starts(used);
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
@@ -180,7 +240,7 @@ impl Run<'_> {
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
-        let (joint, alone) = (geometric_mean(&found.held_out), geometric_mean(&found.held_out_merge));
+        let (joint, alone) = (blind::geometric_mean(&found.held_out), blind::geometric_mean(&found.held_out_merge));
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
@@ -191,6 +251,7 @@ impl Run<'_> {
             "believed": believed,
             "in_doubt": doubtful,
             "extent_px": extents,
+            "estimated_at_scale": found.scale,
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
         });
@@ -204,13 +265,17 @@ impl Run<'_> {
             ))?;
             return Ok(None);
         }
-        let luminance = found.luminance.crop(found.pad, found.pad, w, h);
         // The colours as the TSFs place the frames.
         for (&i, tsf) in used.iter().zip(&found.tsfs) {
             self.motions[i] = tsf.centre();
         }
         let merged = self.luminances(used).1;
-        Ok(Some(Found { start: Self::coloured(&merged, &luminance), tsfs: found.tsfs, reference: used[found.reference] }))
+        Ok(Some(Found {
+            start: Self::coloured(&merged, &found.luminance),
+            tsfs: found.tsfs,
+            reference: used[found.reference],
+            reduced: found.scale > 1,
+        }))
     }
 
     /// Masks by which the frame `i` alone counts.

@@ -1,6 +1,7 @@
 //! Where to look at the blur: patches chosen by how well they determine a PSF, spread over the frame.
 
 use crate::image::Plane;
+use glam::DVec2;
 use serde::Serialize;
 
 /// A square part of the frame.
@@ -21,6 +22,12 @@ impl Patch {
     pub fn centre(&self) -> (f64, f64) {
         let half = (self.size as f64 - 1.0) / 2.0;
         (self.x as f64 + half, self.y as f64 + half)
+    }
+
+    /// Centre in centred pixels of a frame of `size`.
+    pub fn centred(&self, size: (usize, usize)) -> DVec2 {
+        let (x, y) = self.centre();
+        DVec2::new(x - 0.5 * (size.0 as f64 - 1.0), y - 0.5 * (size.1 as f64 - 1.0))
     }
 }
 

@@ -2,7 +2,7 @@
 //! `‖h_l² * B_l^ref - h_l^ref * B_l²‖²` smallest, with `h_l^ref = M_l h_T^ref`.
 
 use super::Tsf;
-use super::align_within::{centred, psf_at};
+use super::align_within::psf_at;
 use super::taps::Interpolation;
 use crate::image::Plane;
 use crate::psf::{Patch, Psf};
@@ -33,7 +33,7 @@ pub fn align_across(
     psfs.par_iter()
         .map(|(patch, h)| {
             let cut = |p: &Plane| p.crop(patch.x, patch.y, patch.size.min(p.width - patch.x), patch.size.min(p.height - patch.y));
-            let there = psf_at(reference, centred(patch, frame.size()), h.radius);
+            let there = psf_at(reference, patch.centred(frame.size()), h.radius);
             let (own, other, seen) = (blurred(&cut(reference_frame), h), blurred(&cut(frame), &there), cut(weights));
             best_shift(&own, &other, &seen, h.radius)
         })

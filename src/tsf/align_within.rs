@@ -74,12 +74,6 @@ pub(super) fn distance(a: &Psf, b: &Psf) -> f64 {
     a.values.data.iter().zip(&b.values.data).map(|(x, y)| f64::from(x - y).powi(2)).sum()
 }
 
-/// The middle of `patch`, centred pixels of a `size` frame.
-pub(super) fn centred(patch: &Patch, size: (usize, usize)) -> DVec2 {
-    let c = patch.centre();
-    DVec2::new(c.0 - (size.0 as f64 - 1.0) / 2.0, c.1 - (size.1 as f64 - 1.0) / 2.0)
-}
-
 /// Aligns the PSFs of one `width` x `height` frame, all of one radius, with poses on `grid`. The PSF nearest to the frame's centre stays on its
 /// centroid, to the half pixel: any common shift of all of them is free. `None` without PSFs or when no pose explains them.
 pub fn align_within(psfs: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height: usize) -> Option<Within> {
@@ -93,7 +87,7 @@ pub fn align_within(psfs: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
         })
         .collect();
     let mut order: Vec<usize> = (0..psfs.len()).collect();
-    order.sort_by(|&a, &b| centred(&psfs[a].0, size).length().total_cmp(&centred(&psfs[b].0, size).length()));
+    order.sort_by(|&a, &b| psfs[a].0.centred(size).length().total_cmp(&psfs[b].0.centred(size).length()));
     let fixed = *order.first()?;
     let moved = |l: usize, s: (f64, f64)| (psfs[l].0, shifted(&psfs[l].1, s));
     let fit = |of: &[usize], shifts: &[(f64, f64)]| {
@@ -122,7 +116,7 @@ pub fn align_within(psfs: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
     let (mut wrong, mut all) = (0.0, 0.0);
     for (l, &s) in shifts.iter().enumerate() {
         let (patch, h) = moved(l, s);
-        wrong += distance(&h, &psf_at(&tsf, centred(&patch, size), h.radius));
+        wrong += distance(&h, &psf_at(&tsf, patch.centred(size), h.radius));
         all += h.values.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
     }
     Some(Within { tsf, shifts, error: wrong / all })
@@ -130,7 +124,7 @@ pub fn align_within(psfs: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
 
 /// The half-pixel shift around `from` under which `tsf` explains the PSF best.
 fn best((patch, h): &(Patch, Psf), tsf: &Tsf, from: (f64, f64), size: (usize, usize)) -> (f64, f64) {
-    let model = psf_at(tsf, centred(patch, size), h.radius);
+    let model = psf_at(tsf, patch.centred(size), h.radius);
     let near = |k: i32| f64::from(k) / 2.0;
     let candidates = (-REACH..=REACH).flat_map(|j| (-REACH..=REACH).map(move |i| (from.0 + near(i), from.1 + near(j))));
     candidates.map(|s| (distance(&shifted(h, s), &model), s)).min_by(|a, b| a.0.total_cmp(&b.0)).map_or(from, |found| found.1)

@@ -88,9 +88,10 @@ impl<'a> Evidence<'a> {
         r
     }
 
-    /// Sparse non-negative weights of `poses` (eq. 6 against the frame instead of PSFs). λ is the level that the gradient of noise alone,
-    /// whose weighted differences have variance 1, does not exceed among so many poses: `√(2 ln n)` times a column's length.
-    pub fn weigh(&self, poses: &[Pose], focal: f64) -> Option<Tsf> {
+    /// Sparse non-negative weights of `poses` (eq. 6 against the frame instead of PSFs). λ is the level that the gradient of noise alone
+    /// does not exceed among so many poses: `√(2 ln n)` times a column's length, times the standard deviation `noise` of the weighted
+    /// differences (1 for what their variances say).
+    pub fn weigh(&self, poses: &[Pose], focal: f64, noise: f64) -> Option<Tsf> {
         let n = poses.len();
         let columns: Vec<Vec<f32>> = poses.par_iter().map(|p| self.column(p, focal)).collect();
         let rows = self.targets.len();
@@ -101,7 +102,7 @@ impl<'a> Evidence<'a> {
         let g: Vec<f64> = g.iter().copied().collect();
         let mut lengths: Vec<f64> = (0..n).map(|i| g[i * n + i].sqrt()).collect();
         lengths.sort_by(f64::total_cmp);
-        let lambda = (2.0 * (n as f64).ln()).sqrt() * lengths[n / 2];
+        let lambda = noise * (2.0 * (n as f64).ln()).sqrt() * lengths[n / 2];
         let mut h = vec![0.0; n];
         coordinate_descent(&g, c.as_slice(), lambda, &mut h, 200, 1e-4);
         Tsf::new(focal, poses.iter().zip(&h).map(|(p, w)| Pose { weight: *w, ..*p }).collect()).ok()

@@ -288,7 +288,7 @@ impl WholeFrame<'_> {
             let margin = margin(&here, (fw, fh));
             if l < count {
                 let rows = frame.rows(ROWS / 2, margin);
-                here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal)?;
+                here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal, 1.0)?;
             }
             here = gathered(&here, &chart)?;
             let rows = frame.rows(ROWS, margin);
@@ -318,6 +318,18 @@ impl WholeFrame<'_> {
         let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart) else { return tsf.clone() };
         let rows = frame.rows(ROWS, margin(&start, size));
         filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale).about(self.base)
+    }
+
+    /// Sparse poses within a pixel's step of those of `start`, in roll and translation, where that is already near; `None` when nothing
+    /// fits. λ follows what `start` leaves unexplained: while the latent irradiance is not yet right, that is more than noise, and poses that
+    /// answer to it widen the TSF.
+    pub fn fit_around(&self, start: &Tsf) -> Option<Tsf> {
+        let (w, h) = self.size();
+        let chart = Chart::new(Model::Rigid, start.focal_px, w, h);
+        let rows = self.rows(ROWS / 2, margin(start, (w, h)));
+        let evidence = Evidence::new(self, &rows);
+        let left = evidence.residual(start).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / rows.len().max(1) as f64;
+        evidence.weigh(&around(start, &chart, 1.0), chart.focal, 2.0 * left.sqrt())
     }
 
     /// The coarser levels of the pyramid: 1/2, 1/4, ...
@@ -401,7 +413,7 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
 }
 
 /// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.
-fn filled(tsf: &Tsf, factor: f64) -> Tsf {
+pub fn filled(tsf: &Tsf, factor: f64) -> Tsf {
     let mut out = scaled(tsf, factor);
     let n = factor as i32;
     if n > 1 {

@@ -12,6 +12,7 @@ mod whole_frame;
 
 pub use align_across::{align_across, blurred};
 pub use align_within::{Within, align_within, psf_at, shifted};
+pub(crate) use estimate::filled;
 pub use estimate::{Estimate, Search, Trial, extent, path_at};
 pub use from_psfs::from_psfs;
 pub use model::Model;
