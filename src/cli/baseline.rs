@@ -36,7 +36,7 @@ pub(super) struct BaselineArgs {
     /// Use these TSFs instead of estimating them (naive, unshaken)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,
-    /// When no frame is sharp: auto, joint, patches or off, as for 'unshaken merge' (naive, uniform, unshaken) [default: off]
+    /// When no frame is sharp: auto, joint, patches or off, as for 'unshaken merge' (naive, uniform, unshaken) [default: auto]
     #[arg(long, value_name = "auto|joint|patches|off", conflicts_with = "tsf")]
     pub blind: Option<String>,
     /// The same exposures from a tripod, for the method 'tripod'
