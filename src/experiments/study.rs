@@ -59,7 +59,7 @@ impl Exposures {
         match self {
             Self::Sharp3 => plan,
             Self::Shaken3 => Plan { times: vec![1.0 / 30.0, 1.0 / 8.0, 1.0], shaken: 0, median: 0.6, ..plan },
-            Self::Jpeg => Plan { times: vec![1.0 / 100.0, 1.0 / 50.0, 1.0 / 2.0], shaken: 2, median: 0.4, apart: 0.01, jpeg: true },
+            Self::Jpeg => Plan { times: vec![1.0 / 100.0, 1.0 / 50.0, 1.0 / 2.0], shaken: 2, median: 1.0, apart: 0.01, jpeg: true },
             Self::JpegShaken => Plan { times: vec![1.0 / 6.0, 1.0 / 2.0, 2.0], shaken: 0, median: 0.2, jpeg: true, ..plan },
             Self::Apart => Plan { times: vec![1.0 / 40.0, 1.0 / 15.0, 1.0 / 4.0, 1.0], shaken: 2, median: 0.6, apart: 0.1, ..plan },
         }
