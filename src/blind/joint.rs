@@ -49,8 +49,8 @@ const COARSEST: usize = 250;
 const ROUNDS: (usize, usize) = (12, 5);
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
-/// Rounds after which the better start is chosen. After two, a start from a more blurred frame, which it explains by standing still, may lead.
-const TRIAL: usize = 4;
+/// Rounds of those at the coarsest level before smoothness falls.
+const SEARCH: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
 const LAMBDA: f32 = 3.0;
 /// Smoothness at the start of the coarsest level and of a finer one, in units of λ.
@@ -283,14 +283,16 @@ fn coarsest(frames: &[Frame]) -> usize {
     scale
 }
 
-/// Luminance and TSFs at the coarsest `level`: from the best of `starts`, smoothness and trust in the operators falling. `None` when `going`
-/// returns `false`, which it is asked after each round.
+/// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
+/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
+/// `false`, which it is asked after each round.
 fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best: Option<(f64, State)> = None;
     for start in starts {
         let mut state = level.begin(start);
-        for _ in 0..TRIAL {
-            level.round(&mut state, SMOOTHNESS.0, MODEL_ERROR.0);
+        for k in 0..ROUNDS.0 {
+            let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
+            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t));
             if !going() {
                 return None;
             }
@@ -300,27 +302,14 @@ fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool)
             best = Some((value, state));
         }
     }
-    let (_, mut state) = best?;
-    for k in TRIAL..ROUNDS.0 {
-        let t = (k + 1 - TRIAL) as f32 / (ROUNDS.0 - TRIAL) as f32;
-        level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t));
-        if !going() {
-            return None;
-        }
-    }
-    Some(state)
-}
-
-/// Rounds at the coarsest level from so many starts.
-fn coarse_rounds(starts: usize) -> usize {
-    ROUNDS.0 + TRIAL * (starts - 1)
+    best.map(|b| b.1)
 }
 
 /// Extent of each frame's blur in pixels as the coarsest level tells it, for frames of a few hundred pixels: enough to know which of them
 /// stood still. `None` as for [`estimate`].
 pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Vec<f64>> {
     let scale = coarsest(frames);
-    let (mut done, total) = (0, coarse_rounds(starts.len()));
+    let (mut done, total) = (0, ROUNDS.0 * starts.len());
     let level = Level::new(frames, scale, false);
     let state = at_coarsest(&level, starts, &mut || {
         done += 1;
@@ -339,7 +328,7 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         last *= 2;
     }
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
-    let mut total = cost(first, coarse_rounds(starts.len()));
+    let mut total = cost(first, ROUNDS.0 * starts.len());
     let mut s = first;
     while s > last {
         s /= 2;

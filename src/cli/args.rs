@@ -121,7 +121,7 @@ pub(super) struct MergeArgs {
     /// Interpolation of the warps
     #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
     pub interpolation: String,
-    /// When no frame is sharp: auto (all blurs and the scene together; also when no frame is surely sharp), joint (so even if a frame passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: off]
+    /// When no frame is sharp: auto (all blurs and the scene together; also when frames only pass for sharp and all turn out to have moved), joint (so whatever passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: auto]
     #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)

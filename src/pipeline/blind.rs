@@ -59,15 +59,13 @@ const LEAST_WINDOW: usize = 96;
 /// Displacement in pixels of a frame's window that the search covers.
 const DISPLACED: f64 = 4.0;
 
-/// The frames to look at where frames pass for sharp, but none surely: those, and one more where it is a single one.
+/// The frames to look at where frames pass for sharp, but none surely: those, and all where it is a single one.
 pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> Option<Vec<usize>> {
-    let (mut passing, mut others): (Vec<usize>, Vec<usize>) = used.iter().partition(|&&i| sharp[i]);
+    let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
     if passing.is_empty() || passing.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
         return None;
     }
-    others.sort_by(|&a, &b| verdicts[b].steepness.total_cmp(&verdicts[a].steepness));
-    passing.extend(others.first().filter(|_| passing.len() == 1));
-    (passing.len() > 1).then_some(passing)
+    Some(if passing.len() > 1 { passing } else { used.to_vec() })
 }
 
 impl Run<'_> {
@@ -136,6 +134,9 @@ impl Run<'_> {
         let most = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
         let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
         let (rw, rh) = (room(w, most.x), room(h, most.y));
+        if frames.len() < 2 {
+            return Ok(false);
+        }
         let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
         let (ww, wh) = (longest(rw, rh), longest(rh, rw));
         if ww.min(wh) < LEAST_WINDOW {

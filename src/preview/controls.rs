@@ -190,7 +190,9 @@ fn parameters(app: &mut App, ui: &mut egui::Ui) {
             }
         });
     egui::ComboBox::from_label("No frame sharp").width(130.0).selected_text(p.blind.clone()).show_ui(ui, |ui| {
-        for (word, text) in [("off", "merge only"), ("auto", "estimate all blurs"), ("joint", "estimate all, always")] {
+        for (word, text) in
+            [("auto", "estimate all blurs"), ("joint", "estimate all, always"), ("patches", "from pairs of patches"), ("off", "merge only")]
+        {
             ui.selectable_value(&mut p.blind, word.to_string(), format!("{word}: {text}"));
         }
     });

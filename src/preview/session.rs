@@ -80,7 +80,7 @@ impl Default for Parameters {
             model: merge.model.name().into(),
             psf_radius: 0,
             align: merge.align,
-            blind: "off".into(),
+            blind: "auto".into(),
             response: String::new(),
             reference: None,
             divisor: 1,

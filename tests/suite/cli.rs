@@ -434,6 +434,35 @@ fn a_bracket_without_a_sharp_frame_is_merged_with_a_warning() {
     assert!(column(&report, "triage").iter().all(|t| t["sharp"] == false), "{:?}", column(&report, "triage"));
 }
 
+#[test]
+fn a_bracket_without_a_sharp_frame_is_deblurred_by_default() {
+    let dir = tempdir().unwrap();
+    let truth = tiny(dir.path(), [4.0, 5.0, 7.0], 1.5);
+    let (merged, merged_scale, report, _) = merge_tiny(dir.path(), "merged", &["--blind", "off"]);
+    assert_eq!(report["blind"], Value::Null);
+    let (found, scale, report, said) = merge_tiny(dir.path(), "found", &[]);
+    assert!(report["blind"]["method"] == "joint" && report["blind"]["believed"] == true, "{}", report["blind"]);
+    assert_eq!(report["blind"]["reference"], report["reference"]);
+    assert!(!said.contains("warning"), "{said}");
+    assert!(column(&report, "sharp").iter().all(|s| *s == false));
+    // The rim is what frames see of elsewhere.
+    let inner = |e: &Rgb| e.map_planes(|p| p.crop(8, 8, TINY.0 - 16, TINY.1 - 16));
+    let away = |e: &Rgb, scale: Option<f64>| log_difference(&inner(e), &inner(&truth), 1.0 / scale.unwrap() as f32);
+    let (found, merged) = (away(&found, scale), away(&merged, merged_scale));
+    assert!(found < 0.8 * merged, "log irradiance is {found} off, that of the merge {merged}");
+}
+
+#[test]
+fn the_papers_path_runs_on_request() {
+    let dir = tempdir().unwrap();
+    tiny(dir.path(), [4.0, 5.0, 7.0], 1.5);
+    let (_, _, report, said) = merge_tiny(dir.path(), "patches", &["--blind", "patches"]);
+    assert_eq!(report["blind"]["method"], "patches", "{said}");
+    let patches = report["blind"]["patches"].as_array().unwrap();
+    assert!(patches.len() == 3 && patches.iter().all(|f| !f["psfs"].as_array().unwrap().is_empty()), "{}", report["blind"]);
+    assert!(column(&report, "tsf").iter().all(|t| t["poses"].as_array().is_some_and(|p| !p.is_empty())));
+}
+
 /// Camera files, their own curve: window and desk of the office, at half size to be quick.
 #[test]
 fn office_is_calibrated_and_merged() {
