@@ -44,8 +44,7 @@ impl Pose {
     /// `K R K^-1`: the rotational part of Γ.
     pub fn rotation(&self, focal_px: f64) -> DMat3 {
         let v = DVec3::new(self.theta_x_deg, self.theta_y_deg, self.theta_z_deg) * std::f64::consts::PI / 180.0;
-        let angle = v.length();
-        let r = if angle < 1e-15 { DMat3::IDENTITY } else { DMat3::from_axis_angle(v / angle, angle) };
+        let r = turn(v);
         let k = DMat3::from_diagonal(DVec3::new(focal_px, focal_px, 1.0));
         let h = k * r * k.inverse();
         h * (1.0 / h.z_axis.z)
@@ -55,6 +54,22 @@ impl Pose {
     pub fn apply(&self, focal_px: f64, p: DVec2) -> DVec2 {
         project(&self.homography(focal_px), p)
     }
+}
+
+/// exp(Φ) of eq. (2), by Rodrigues. Sine and cosine are not the machine's own: a synthetic bracket is to be the same everywhere.
+fn turn(v: DVec3) -> DMat3 {
+    let angle = v.length();
+    if angle < 1e-15 {
+        return DMat3::IDENTITY;
+    }
+    let (sin, cos) = libm::sincos(angle);
+    let a = v / angle;
+    let (s, b) = (a * sin, a * (1.0 - cos));
+    DMat3::from_cols(
+        DVec3::new(cos + a.x * b.x, a.y * b.x + s.z, a.z * b.x - s.y),
+        DVec3::new(a.x * b.y - s.z, cos + a.y * b.y, a.z * b.y + s.x),
+        DVec3::new(a.x * b.z + s.y, a.y * b.z - s.x, cos + a.z * b.z),
+    )
 }
 
 /// `h p` with the perspective division.

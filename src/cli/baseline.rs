@@ -41,12 +41,18 @@ pub(super) struct BaselineArgs {
     /// Use these TSFs instead of estimating them (naive, unshaken)
     #[arg(long, value_name = "FILE.json")]
     pub tsf: Option<PathBuf>,
+    /// When no frame is sharp: auto, joint, patches or off, as for 'unshaken merge' (naive, uniform, unshaken) [default: auto]
+    #[arg(long, value_name = "auto|joint|patches|off", conflicts_with = "tsf")]
+    pub blind: Option<String>,
     /// The same exposures from a tripod, for the method 'tripod'
     #[arg(long, value_name = "FRAME,FRAME,...", value_delimiter = ',')]
     pub tripod: Vec<PathBuf>,
     /// Judge all against this irradiance
     #[arg(long, value_name = "TRUTH.exr")]
     pub truth: Option<PathBuf>,
+    /// Move the truth onto each result before judging it: results of all-blurred brackets may lie a few pixels off
+    #[arg(long, value_enum, default_value = "none", requires = "truth")]
+    pub align: compare::Alignment,
     /// Judge only where the truth is below this value
     #[arg(long, value_name = "VALUE", requires = "truth")]
     pub limit: Option<f32>,
@@ -106,6 +112,7 @@ pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
         None => merge::read_response(Path::new(&args.response))?,
     };
     let tsf = args.tsf.as_deref().map(merge::read_tsf).transpose()?;
+    let blind = merge::blind(args.blind.as_deref())?;
     std::fs::create_dir_all(&args.output_dir)
         .with_context(|| format!("{}: cannot be made; choose another --output-dir", args.output_dir.display()))?;
     let target = |m: Method, extension: &str| Output::check(&args.output_dir.join(format!("{}.{extension}", m.name())), args.overwrite);
@@ -125,7 +132,7 @@ pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
         } else {
             None
         };
-        let settings = Settings { sharp: sharp.clone(), ..Settings::default() };
+        let settings = Settings { sharp: sharp.clone(), blind, ..Settings::default() };
         let joint = if methods.iter().any(|m| matches!(m, Method::Naive | Method::Uniform | Method::Unshaken | Method::DebevecSharp)) {
             Some(Joint::new(&bracket, &response, &settings, tsf.as_ref(), events)?)
         } else {
@@ -160,7 +167,10 @@ pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
             staged.push(target(m, "png")?.stage_png(&picture)?);
             let judge = Judge { limit: args.limit, ..Judge::default() };
             let score = match &truth {
-                Some(truth) if m != Method::Mertens => Some(metrics::score(&image, truth, &judge)?),
+                Some(truth) if m != Method::Mertens => {
+                    let (there, _) = metrics::align(&image, truth, args.align.into())?;
+                    Some(metrics::score(&image, &there, &judge)?)
+                }
                 _ => None,
             };
             rows.push(Made { method: m, score, sharpness: metrics::cpbd_of(&picture), staged });

@@ -23,7 +23,7 @@ pub(super) struct ExperimentArgs {
     #[arg(long, value_name = "DIR")]
     pub output_dir: PathBuf,
     /// Width of the frames in pixels; their height is three quarters of it
-    #[arg(long, value_name = "PX", default_value_t = 256, value_parser = clap::value_parser!(u32).range(160..=2048))]
+    #[arg(long, value_name = "PX", default_value_t = 192, value_parser = clap::value_parser!(u32).range(160..=2048))]
     pub width: u32,
     /// Seed of scenes, shake and noise
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -58,10 +58,11 @@ pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
         at(format!("{}.jpg", e.name()))?;
     }
     let begun = std::time::Instant::now();
-    let texts = with_progress(|events| {
+    let (texts, times) = with_progress(|events| {
         let photographs = photographs.as_deref().map(|p| frames::read(p, None)).transpose()?;
         let mut lab = Lab::new(args.width as usize, args.seed, photographs);
         let mut texts = Vec::new();
+        let mut times = Vec::new();
         for (i, &e) in chosen.iter().enumerate() {
             let mut hear = |event: Event| match event {
                 Event::Progress { stage, fraction } => events(Event::Progress {
@@ -70,7 +71,9 @@ pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
                 }),
                 warning => events(warning),
             };
+            let begun = std::time::Instant::now();
             let report = lab.run(e, &mut hear)?;
+            times.push(format!("{} {:.0} s", e.name(), begun.elapsed().as_secs_f64()));
             let text = markdown(e, &report);
             let staged: Vec<Staged> = vec![
                 at(format!("{}.md", e.name()))?.stage(|to| to.write_all(text.as_bytes()).map_err(|e| e.to_string()))?,
@@ -81,10 +84,11 @@ pub(super) fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
             }
             texts.push(text);
         }
-        Ok(texts)
+        Ok((texts, times))
     })?;
     println!("{}", texts.join("\n"));
-    println!("wrote tables and pictures to {} in {:.0} s", args.output_dir.display(), begun.elapsed().as_secs_f64());
+    let seconds = begun.elapsed().as_secs_f64();
+    println!("wrote tables and pictures to {} in {seconds:.0} s ({})", args.output_dir.display(), times.join(", "));
     Ok(())
 }
 

@@ -373,6 +373,18 @@ fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize, relative: bool
     )
 }
 
+/// `--blind`.
+pub(super) fn blind(word: Option<&str>) -> Result<Blind, Usage> {
+    match word {
+        None => Ok(Blind::default()),
+        Some("auto") => Ok(Blind::Auto),
+        Some("joint") => Ok(Blind::Joint),
+        Some("patches") => Ok(Blind::Patches),
+        Some("off") => Ok(Blind::Off),
+        Some(word) => Err(Usage(format!("--blind: {word:?} is neither auto, joint, patches nor off"))),
+    }
+}
+
 fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     let n = args.frames.len();
     let mut settings = Settings { align: !args.no_align, ..Settings::default() };
@@ -429,14 +441,7 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         _ => Interpolation::Bilinear,
     };
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
-    settings.blind = match args.blind.as_deref() {
-        None => Blind::default(),
-        Some("auto") => Blind::Auto,
-        Some("joint") => Blind::Joint,
-        Some("patches") => Blind::Patches,
-        Some("off") => Blind::Off,
-        Some(word) => return Err(Usage(format!("--blind: {word:?} is neither auto, joint, patches nor off"))),
-    };
+    settings.blind = blind(args.blind.as_deref())?;
     if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {
         return Err(Usage(format!("--blind {word} estimates the TSFs that --tsf gives; leave one of them out")));
     }

@@ -71,7 +71,7 @@ pub(super) fn run(lab: &mut Lab, events: Events) -> Result<Report> {
                t_y, a quarter of a pixel per pixel; a row per frame, in the table's order."
             .into(),
         table,
-        picture: sheet::sheet(&rows, 150),
+        picture: sheet::sheet(&rows, 190),
     })
 }
 

@@ -2,11 +2,13 @@
 
 use super::study::{Events, Method, Study};
 use crate::error::Result;
+use crate::exposure::Bracket;
 use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::merge::gradient_level;
 use crate::noise;
 use crate::psf::{self, Patch, Psf};
+use crate::response::Response;
 
 /// Patches per frame.
 const PATCHES: usize = 9;
@@ -17,11 +19,11 @@ pub(super) const RADIUS: usize = 15;
 /// Standard deviation of the blur model's own error, as a part of the mean absolute gradient around a pixel.
 const MODEL_ERROR: f32 = 0.03;
 
-/// Irradiance of frame `i` (mean of the channels) and its inverse variance, 0 where it is clipped or hardly exposed.
-pub(super) fn seen(study: &Study, i: usize, latent: &Plane) -> (Plane, Plane) {
-    let frames = study.made.bracket.frames();
-    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &study.response)).collect();
-    let level = noise::estimate(frames, &exposures, &study.response);
+/// Irradiance of frame `i` (mean of the channels) and its inverse variance, 0 where it is clipped. `latent`: the scene as far as it is known.
+pub(super) fn seen(bracket: &Bracket, response: &Response, i: usize, latent: &Plane) -> (Plane, Plane) {
+    let frames = bracket.frames();
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
+    let level = noise::estimate(frames, &exposures, response);
     let dt = frames[i].exposure_time as f32;
     let (clipped, local, exposure) = (mask::clipped(&frames[i]), gradient_level(latent, 4), exposures[i].mean());
     let weight = |p: usize| {
@@ -36,7 +38,7 @@ pub(super) fn seen(study: &Study, i: usize, latent: &Plane) -> (Plane, Plane) {
 /// Patches of the shaken frame `i` and their PSFs by eq. (11) against the sharp frames; nothing is known of the TSF.
 pub(super) fn measured(study: &Study, i: usize, events: Events) -> Result<Vec<(Patch, Psf)>> {
     let latent = study.result(Method::Denoised, events)?.mean();
-    let (blurred, weight) = seen(study, i, &latent);
+    let (blurred, weight) = seen(&study.made.bracket, &study.response, i, &latent);
     let (w, h) = latent.size();
     let patches = psf::choose(&latent, &weight, SIZE.min(w / 2).min(h / 2), PATCHES);
     let of = |p: Patch| psf::estimate(&latent, 0, &blurred, &weight, &p, RADIUS).map(|psf| (p, psf));

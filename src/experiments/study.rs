@@ -59,9 +59,9 @@ impl Exposures {
         match self {
             Self::Sharp3 => plan,
             Self::Shaken3 => Plan { times: vec![1.0 / 30.0, 1.0 / 8.0, 1.0], shaken: 0, median: 0.6, ..plan },
-            Self::Jpeg => Plan { times: vec![1.0 / 100.0, 1.0 / 50.0, 1.0 / 2.0], shaken: 2, median: 0.4, apart: 0.01, jpeg: true },
+            Self::Jpeg => Plan { times: vec![1.0 / 100.0, 1.0 / 50.0, 1.0 / 2.0], shaken: 2, median: 1.0, apart: 0.01, jpeg: true },
             Self::JpegShaken => Plan { times: vec![1.0 / 6.0, 1.0 / 2.0, 2.0], shaken: 0, median: 0.2, jpeg: true, ..plan },
-            Self::Apart => Plan { times: vec![1.0 / 40.0, 1.0 / 15.0, 1.0 / 4.0, 1.0], shaken: 2, median: 0.1, apart: 0.1, ..plan },
+            Self::Apart => Plan { times: vec![1.0 / 40.0, 1.0 / 15.0, 1.0 / 4.0, 1.0], shaken: 2, median: 0.6, apart: 0.1, ..plan },
         }
     }
 }
@@ -85,18 +85,19 @@ pub(super) enum Shaking {
 }
 
 impl Shaking {
-    /// Shake of frames of `width` pixels: a hand at 2 s moves the picture by a few hundredths of its width.
+    /// Shake of frames of `width` pixels: a hand at 2 s moves the picture by a few hundredths of its width, and turns it by up to the three degrees
+    /// that the paper allows, which move the corners by as much again.
     fn shake(self, width: usize, focal_px: f64) -> Shake {
         let extent = 0.028 * width as f64;
-        let tremor = Tremor { extent_px: extent, roll_deg: 1.2, offset_px: 1.0, offset_deg: 0.1 };
-        let wobble = Wobble { shift_m: extent * 0.8 * 2.0 / focal_px, nearing_m: 0.002, tilt_deg: 0.6, roll_deg: 0.9, depth_m: 2.0 };
+        let tremor = Tremor { extent_px: extent, roll_deg: 2.4, offset_px: 1.0, offset_deg: 0.1 };
+        let wobble = Wobble { shift_m: extent * 0.8 * 2.0 / focal_px, nearing_m: 0.002, tilt_deg: 0.6, roll_deg: 1.8, depth_m: 2.0 };
         match self {
             Self::Grid => Shake::Grid(tremor),
             Self::Tremor => Shake::Tremor(tremor),
             Self::SixD => Shake::SixD(wobble),
             Self::Turning => {
                 let tilt_deg = (extent / focal_px).to_degrees();
-                Shake::SixD(Wobble { shift_m: 0.1 * wobble.shift_m, nearing_m: 0.0, tilt_deg, roll_deg: 1.2, ..wobble })
+                Shake::SixD(Wobble { shift_m: 0.1 * wobble.shift_m, nearing_m: 0.0, tilt_deg, roll_deg: 2.4, ..wobble })
             }
         }
     }

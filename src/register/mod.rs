@@ -174,6 +174,18 @@ impl<'a> Registrar<'a> {
         found
     }
 
+    /// SIFT features of frame `i` that match those registered before, and how many of the matches agree with one motion. Nothing is registered.
+    pub fn matches(&self, i: usize, sharp: bool) -> (usize, usize) {
+        let (levels, fits) = (pyramid(self.picture(i)), |p: &Picture| p.size().0.max(p.size().1) <= FEATURE_SIDE);
+        let at = levels.iter().position(fits).unwrap_or(levels.len() - 1);
+        let black = levels[at].black.max(self.merged[at].black);
+        let reference = self.merged[at].tone(black);
+        let pairs = features::matches(&reference, &levels[at].tone(black));
+        let scale = 0.5 * (reference.size().0 as f64).hypot(reference.size().1 as f64);
+        let most = if sharp { Model::Homography } else { Model::Rigid };
+        (pairs.len(), consensus(&pairs, scale, most).map_or(0, |c| c.inliers))
+    }
+
     /// Whether a hand may have moved the camera so between two frames: little of such a frame would be left on the reference.
     fn plausible(&self, motion: &DMat3) -> bool {
         let (w, h) = self.frames[self.reference].intensity.size();

@@ -62,9 +62,10 @@ impl Response {
         let z = z.clamp(0.0, 1.0);
         match self {
             Self::Srgb if z <= 0.04045 => z / 12.92,
-            Self::Srgb => ((z + 0.055) / 1.055).powf(2.4),
+            // Not the machine's own power: synthetic brackets are to be the same everywhere.
+            Self::Srgb => libm::pow((z + 0.055) / 1.055, 2.4),
             Self::Linear => z,
-            Self::Gamma(g) => z.powf(*g),
+            Self::Gamma(g) => libm::pow(z, *g),
             Self::Table(t) => {
                 let t = &t[channel];
                 let s = z * (t.len() - 1) as f64;

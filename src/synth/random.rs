@@ -67,5 +67,5 @@ fn ln_factorial(k: f64) -> f64 {
         return (2..=k as u32).map(|i| f64::from(i).logarithm()).sum();
     }
     let n = k + 1.0;
-    (n - 0.5) * n.logarithm() - n + 0.5 * std::f64::consts::TAU.logarithm() + 1.0 / (12.0 * n) - 1.0 / (360.0 * n.powi(3))
+    (n - 0.5) * n.logarithm() - n + 0.5 * std::f64::consts::TAU.logarithm() + 1.0 / (12.0 * n) - 1.0 / (360.0 * n * n * n)
 }

@@ -552,6 +552,13 @@ fn synth_makes_a_bracket_that_merge_and_compare_understand() {
     assert_eq!(listing(&dir.path().join("m")), ["debevec.exr", "debevec.png", "mertens.png", "tripod.exr", "tripod.png"]);
     let rows: Value = serde_json::from_str(&run("compare --align rigid --json m/debevec.exr m/tripod.exr b/truth.exr")).unwrap();
     assert!(rows[1]["pu_psnr"].as_f64().unwrap() > rows[0]["pu_psnr"].as_f64().unwrap() && rows[0]["moved"]["x"].is_number(), "{rows}");
+    let aligned = run(
+        "baseline --output-dir a --method debevec --align rigid --truth b/truth.exr --exposures 1/30,1/8,1 b/frame1.jpg b/frame2.jpg b/frame3.jpg",
+    );
+    let got: f64 = aligned.lines().find(|l| l.starts_with("debevec")).unwrap().split_whitespace().nth(1).unwrap().parse().unwrap();
+    let compared = rows[0]["pu_psnr"].as_f64().unwrap();
+    assert!((got - compared).abs() < 0.02, "judged as 'compare' does: {got} against {compared}");
+    assert!((psnr("debevec") - compared).abs() > 0.05, "alignment changes the figure: {compared}");
     run("compare --map error.png m/tripod.exr b/truth.exr");
     assert_eq!(image::open(dir.path().join("error.png")).unwrap().to_rgb8().dimensions(), (48, 24));
     let alone: Value = serde_json::from_str(&run("compare --no-reference --json m/tripod.png b/frame3.jpg")).unwrap();
@@ -580,6 +587,8 @@ fn wrong_synth_compare_and_baseline_options_are_refused() {
         ("experiment office --output-dir other", 2, &["office", "--photographs"]),
         ("experiment office --photographs nowhere --output-dir other", 1, &["nowhere", "--photographs"]),
         ("baseline --output-dir other --method tripod --exposures 1,2 a.png b.png", 2, &["--tripod", "0 tripod frames for 2 frames"]),
+        ("baseline --output-dir other --blind never --exposures 1,2 a.png b.png", 2, &["--blind", "auto, joint, patches nor off"]),
+        ("baseline --output-dir other --align rigid --exposures 1,2 a.png b.png", 2, &["--truth"]),
         ("baseline --output-dir other --method mertens,mertens --exposures 1,2 a.png b.png", 2, &["--method", "named twice"]),
     ]);
 }

@@ -41,3 +41,17 @@ fn figure_5_compares_all_methods() {
     assert!(bright * 20 > report.picture.pixels().len(), "the picture is dark");
     assert!(lab.run(Experiment::Psfs, &mut |_| true).unwrap().table.lines().count() > 6, "local PSFs of both frames");
 }
+
+#[test]
+fn figure_4_finds_the_psfs_of_the_longer_of_two_blurred_frames() {
+    let mut lab = Lab::new(160, 1, None);
+    assert!(lab.run(Experiment::BlindPsfs, &mut |_| false).is_err(), "cancelled");
+    let table = lab.run(Experiment::BlindPsfs, &mut |_| true).unwrap().table;
+    let figures = |line: &str| -> Vec<f64> { line.split('|').filter_map(|c| c.trim().parse().ok()).collect() };
+    let rows: Vec<Vec<f64>> = table.lines().filter(|l| l.contains("| 1 s |")).map(figures).collect();
+    assert!(rows.len() >= 3, "{table}");
+    for row in rows {
+        let [_, _, _, error, point] = row[..] else { panic!("{table}") };
+        assert!(error < 0.5 * point, "smoothed by a pixel {error} off, no blur at all {point}\n{table}");
+    }
+}
