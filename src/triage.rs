@@ -30,8 +30,6 @@ const DETAIL: f64 = 0.6;
 const STEEPNESS: f64 = 0.335;
 /// Relative error of the noise level that is taken off the energies.
 const NOISE_ERROR: f64 = 0.2;
-/// The frame's longer side over the distance that burnt-out light is expected to be spread by blur.
-const REACH: usize = 32;
 /// Lag in pixels of the differences that tell contrast.
 const COARSE: usize = 24;
 /// Directions in which differences are taken.
@@ -41,46 +39,17 @@ struct Luminance {
     value: Plane,    // irradiance
     variance: Plane, // of it
     valid: Vec<bool>,
-    far: Vec<bool>, // valid, and out of reach of what is burnt out
 }
 
 fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
     let clipped = mask::clipped(frame);
     let dt = frame.exposure_time;
     let mean = x.mean();
-    let (w, h) = mean.size();
-    // Below three standard deviations, noise clipped at black is no longer symmetric; the same below white.
+    // Below three standard deviations, noise clipped at black is no longer symmetric.
     let floor = 3.0 * noise.read.sqrt();
-    let ceiling = 1.0 - 3.0 * noise.variance(1.0).sqrt();
-    let white: Vec<bool> = (0..w * h).map(|p| clipped[p] || x.0.iter().any(|c| f64::from(c.data[p]) >= ceiling)).collect();
-    let valid: Vec<bool> = mean.data.iter().zip(&white).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
-    let near = widened(&white, w, w.max(h) / REACH);
-    let far = valid.iter().zip(&near).map(|(v, n)| *v && !n).collect();
+    let valid = mean.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
     let variance = mean.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
-    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, far }
-}
-
-/// Pixels of an image `width` wide within `radius` pixels, along both axes, of one that is set.
-fn widened(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
-    let along = |set: &[bool], n: usize, lines: usize, at: &dyn Fn(usize, usize) -> usize| {
-        let mut out = vec![false; set.len()];
-        for line in 0..lines {
-            let mut last: Option<usize> = None;
-            for k in 0..n + radius {
-                if k < n && set[at(line, k)] {
-                    last = Some(k);
-                }
-                // The pixel `radius` before k has all its neighbours behind it.
-                if k >= radius {
-                    out[at(line, k - radius)] = last.is_some_and(|l| l + 2 * radius >= k);
-                }
-            }
-        }
-        out
-    };
-    let height = set.len() / width.max(1);
-    let rows = along(set, width, height, &|y, x| y * width + x);
-    along(&rows, height, width, &|x, y| y * width + x)
+    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid }
 }
 
 impl Luminance {
@@ -88,31 +57,28 @@ impl Luminance {
     /// fine structure away.
     fn seen(&self, motion: &DMat3) -> Self {
         let (w, h) = self.value.size();
-        let none = vec![false; w * h];
-        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: none.clone(), far: none };
+        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: vec![false; w * h] };
         for p in 0..w * h {
             if let Some(q) = nearest_pixel(motion, w, h, p % w, p / w) {
                 out.value.data[p] = self.value.data[q];
                 out.variance.data[p] = self.variance.data[q];
-                (out.valid[p], out.far[p]) = (self.valid[q], self.far[q]);
+                out.valid[p] = self.valid[q];
             }
         }
         out
     }
 }
 
-/// Noise-free energy and its uncertainty (two standard deviations, and the noise level's own error), of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid
-/// (`far`: and out of reach of what is burnt out) in `a` and `b`;
+/// Noise-free energy and its uncertainty (two standard deviations, and the noise level's own error), of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid in `a` and `b`;
 /// weighted by the larger variance of the two, so that both sums of a pair speak of the same pixels in the same way.
-fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: usize, far: bool) -> (f64, f64) {
-    let (of_a, of_b) = if far { (&a.far, &b.far) } else { (&a.valid, &b.valid) };
+fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: usize) -> (f64, f64) {
     let (w, h) = a.value.size();
     let (dx, dy) = (direction.0 * lag, direction.1 * lag);
     let (mut sum, mut scatter, mut noise) = (0.0, 0.0, 0.0);
     for y in 0..h.saturating_sub(dy) {
         for x in 0..w.saturating_sub(dx) {
             let (i, j) = if direction.2 { (y * w + x + dx, (y + dy) * w + x) } else { (y * w + x, (y + dy) * w + x + dx) };
-            if !(of_a[i] && of_a[j] && of_b[i] && of_b[j]) {
+            if !(a.valid[i] && a.valid[j] && b.valid[i] && b.valid[j]) {
                 continue;
             }
             let own = f64::from(a.variance.data[i] + a.variance.data[j]);
@@ -139,43 +105,28 @@ pub fn triage(
 ) -> Vec<Verdict> {
     let all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
     let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
-    // Least share, over the directions, of the fine structure of frame j that frame i has: far from burnt-out light where that tells.
-    let share = |i: usize, j: usize| -> Option<f64> {
-        // Each of the two on its own pixels, of which those count that the other sees as well.
-        let apart = motions[i] != motions[j];
-        let from_i = apart.then(|| all[j].seen(&(motions[j] * motions[i].inverse())));
-        let from_j = apart.then(|| all[i].seen(&(motions[i] * motions[j].inverse())));
-        let (a, b) = (from_i.as_ref().unwrap_or(&all[j]), from_j.as_ref().unwrap_or(&all[i]));
-        let least = |far: bool| {
-            let told = DIRECTIONS.iter().filter_map(|&direction| {
-                let of_i = |lag: usize| energy(&all[i], a, direction, lag, far);
-                let of_j = |lag: usize| energy(&all[j], b, direction, lag, far);
-                let ((own, own_error), (other, error)) = (of_i(1), of_j(1));
-                let (coarse, coarse_other) = (of_i(COARSE).0, of_j(COARSE).0);
-                // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
-                let contrast = if coarse > 0.0 && coarse_other > 0.0 { (coarse / coarse_other).min(1.0) } else { 1.0 };
-                // Only where the other frame's fine structure stands clear of its noise, and of this frame's.
-                let clear = other > 3.0 * error && other > 3.0 * own_error;
-                clear.then(|| (own + own_error).max(0.0) / (other * contrast))
-            });
-            told.reduce(f64::min)
-        };
-        least(true).or_else(|| least(false))
-    };
-    let shares: Vec<Vec<Option<f64>>> = (0..frames.len())
-        .map(|i| (0..frames.len()).map(|j| (i != j && used.contains(&j)).then(|| share(i, j)).flatten()).collect())
-        .collect();
-    let counts = |i: usize, j: usize| -> Option<f64> {
-        // Blur spreads burnt-out light over what is dark and flat in a sharp frame, so that either may seem to have more structure than the
-        // other: then it is the longer one that moved.
-        let back = shares[j][i].is_some_and(|other| other < DETAIL);
-        shares[i][j].filter(|_| !back || frames[i].exposure_time > frames[j].exposure_time)
-    };
     let mut verdicts: Vec<Verdict> = (0..frames.len())
         .map(|i| {
-            let detail = (0..frames.len()).filter_map(|j| counts(i, j)).fold(1.0, f64::min);
+            let mut detail = 1.0f64;
+            for &j in used.iter().filter(|&&j| j != i) {
+                // Each of the two on its own pixels, of which those count that the other sees as well.
+                let apart = motions[i] != motions[j];
+                let from_i = apart.then(|| all[j].seen(&(motions[j] * motions[i].inverse())));
+                let from_j = apart.then(|| all[i].seen(&(motions[i] * motions[j].inverse())));
+                let (a, b) = (from_i.as_ref().unwrap_or(&all[j]), from_j.as_ref().unwrap_or(&all[i]));
+                for direction in DIRECTIONS {
+                    let ((own, own_error), (other, error)) = (energy(&all[i], a, direction, 1), energy(&all[j], b, direction, 1));
+                    let (coarse, coarse_other) = (energy(&all[i], a, direction, COARSE).0, energy(&all[j], b, direction, COARSE).0);
+                    // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
+                    let contrast = if coarse > 0.0 && coarse_other > 0.0 { (coarse / coarse_other).min(1.0) } else { 1.0 };
+                    // Only where the other frame's fine structure stands clear of its noise, and of this frame's.
+                    if other > 3.0 * error && other > 3.0 * own_error {
+                        detail = detail.min((own + own_error).max(0.0) / (other * contrast));
+                    }
+                }
+            }
             let steep = DIRECTIONS.iter().filter_map(|&d| {
-                let ((one, _), (two, error)) = (energy(&all[i], &all[i], d, 1, false), energy(&all[i], &all[i], d, 2, false));
+                let ((one, _), (two, error)) = (energy(&all[i], &all[i], d, 1), energy(&all[i], &all[i], d, 2));
                 (two > 3.0 * error).then(|| one.max(0.0) / two)
             });
             let steepness = steep.fold(f64::INFINITY, f64::min);
