@@ -553,13 +553,15 @@ impl Run<'_> {
         let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
         let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
-        let base = match &scene {
-            Some(_) => None,
+        let (base, mut latent) = match scene {
+            Some(scene) => (None, scene),
             None => {
-                Some(self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?)
+                let found =
+                    self.solved("sharp frames", "", &first, |run| run.solve(&start_frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
+                let latent = found.cropped();
+                (Some(found), latent)
             }
         };
-        let mut latent = base.as_ref().map(Solution::cropped).or(scene.clone()).unwrap_or(initial.clone());
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;

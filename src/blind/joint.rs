@@ -74,12 +74,12 @@ pub fn shrink(frame: &Frame, scale: usize) -> Frame {
     // White noise falls by the sum of the filter's squared weights.
     let kept = (20.0f32 / 64.0).powi(2);
     let masked = frame.mask.map(|m| if m > 0.0 { 0.0 } else { 1.0 });
-    let lost = halve(&masked);
+    let lost = masked.halved();
     let (w, h) = lost.size();
     let least = |x: usize, y: usize| (0..4).map(|k| frame.mask.at(2 * x + k % 2, 2 * y + k / 2)).fold(1.0, f32::min);
     let half = Frame {
-        blurred: halve(&frame.blurred),
-        variance: halve(&frame.variance).map(|v| v * kept),
+        blurred: frame.blurred.halved(),
+        variance: frame.variance.halved().map(|v| v * kept),
         mask: Plane::from_fn(w, h, |x, y| if lost.at(x, y) > 0.0 { 0.0 } else { least(x, y) }),
         clipped: (0..w * h).map(|p| (0..4).all(|k| frame.clipped[(p / w * 2 + k / 2) * frame.blurred.width + p % w * 2 + k % 2])).collect(),
     };
@@ -88,16 +88,7 @@ pub fn shrink(frame: &Frame, scale: usize) -> Frame {
 
 /// `plane` at 1/`scale` (a power of two) of its size.
 fn shrunk(plane: &Plane, scale: usize) -> Plane {
-    if scale == 1 { plane.clone() } else { shrunk(&halve(plane), scale / 2) }
-}
-
-/// Half the size through the binomial filter [1 3 3 1]/8: means over squares let through what the coarser grid cannot hold, and no warp is
-/// true to that.
-fn halve(p: &Plane) -> Plane {
-    let (w, h) = (p.width / 2, p.height / 2);
-    let f = [0.125f32, 0.375, 0.375, 0.125];
-    let rows = Plane::from_fn(w, p.height, |x, y| (0..4).map(|k| f[k] * p.clamped(2 * x as isize + k as isize - 1, y as isize)).sum());
-    Plane::from_fn(w, h, |x, y| (0..4).map(|k| f[k] * rows.clamped(x as isize, 2 * y as isize + k as isize - 1)).sum())
+    if scale == 1 { plane.clone() } else { shrunk(&plane.halved(), scale / 2) }
 }
 
 /// Bilinear sample.

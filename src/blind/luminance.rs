@@ -216,9 +216,7 @@ impl Frame {
         let clipped = (0..mask.data.len()).map(|p| mask.data[p] == 0.0 && exposure.0.iter().any(|c| c.data[p] > CLIPPED)).collect();
         Self { blurred: exposure.mean().map(|v| v / dt), variance, mask: mask.clone(), clipped }
     }
-}
 
-impl Frame {
     /// The part of `size` pixels whose first is `at`.
     ///
     /// # Panics

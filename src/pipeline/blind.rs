@@ -69,13 +69,27 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
 }
 
 impl Run<'_> {
-    fn luminances(&self, used: &[usize]) -> (Vec<Frame>, Rgb) {
+    /// Masks of a bracket of which no frame counts as sharp.
+    fn all_masks(&self) -> Vec<Plane> {
         let frames = self.bracket.frames();
-        let masks = mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions);
+        mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions)
+    }
+
+    /// Luminance of the frame `i`.
+    fn luminance_frame(&self, i: usize, masks: &[Plane]) -> Frame {
+        Frame::new(&self.exposures[i], &masks[i], &self.curves[i], self.bracket.frames()[i].exposure_time)
+    }
+
+    fn luminance_frames(&self, used: &[usize]) -> Vec<Frame> {
+        let masks = self.all_masks();
+        used.iter().map(|&i| self.luminance_frame(i, &masks)).collect()
+    }
+
+    /// The frames `used` merged as they are placed, without deblurring.
+    fn blurred_merge(&self, used: &[usize]) -> Rgb {
+        let masks = self.all_masks();
         let (aligned, seen) = self.placed(used, &masks, 0);
-        let merged = merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used);
-        let frame = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], frames[i].exposure_time);
-        (used.iter().map(frame).collect(), merged)
+        merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used)
     }
 
     /// `luminance` in the colours of `merged`: those of a blurred merge, but they change less across an edge than the luminance does.
@@ -91,7 +105,7 @@ impl Run<'_> {
     /// Irradiance to start from where the TSFs of all of the frames `used` are known: no frame shows the scene, and the colour
     /// solver's iterations are dear.
     pub(super) fn start_from_tsfs(&mut self, used: &[usize], tsfs: &[Option<Tsf>]) -> Result<Rgb> {
-        let (frames, merged) = self.luminances(used);
+        let (frames, merged) = (self.luminance_frames(used), self.blurred_merge(used));
         let (w, h) = self.bracket.size();
         let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().unwrap_or_else(Tsf::identity)).collect();
         let pad = deblur::pad_for(&known.iter().collect::<Vec<_>>(), w, h, (super::LARGEST_PAD * w.max(h) as f64) as usize);
@@ -125,8 +139,10 @@ impl Run<'_> {
     /// Whether every one of `frames`, which pass for sharp, moved while it was exposed: the joint estimate of a part of the frame with much
     /// texture, at its coarsest level.
     fn all_moved(&mut self, frames: &[usize], from: f32, to: f32) -> Result<bool> {
+        if frames.len() < 2 {
+            return Ok(false);
+        }
         let (w, h) = self.bracket.size();
-        let whole = self.luminances(frames).0;
         // Where each frame's window lies, from the reference's: to the pixel.
         let shift = |i: usize, c: DVec2| (project(&self.motions[i], c) - c).round();
         let corner = DVec2::new(0.5 * w as f64, 0.5 * h as f64);
@@ -134,16 +150,14 @@ impl Run<'_> {
         let most = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
         let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
         let (rw, rh) = (room(w, most.x), room(h, most.y));
-        if frames.len() < 2 {
-            return Ok(false);
-        }
         let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
         let (ww, wh) = (longest(rw, rh), longest(rh, rw));
         if ww.min(wh) < LEAST_WINDOW {
             return Ok(false);
         }
         let (mx, my) = (most.x as usize, most.y as usize);
-        let first = &whole[0];
+        let masks = self.all_masks();
+        let first = self.luminance_frame(frames[0], &masks);
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);
         let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(false) };
@@ -163,7 +177,7 @@ impl Run<'_> {
             let s = shift(i, centre);
             ((x as f64 + s.x) as usize, (y as f64 + s.y) as usize)
         };
-        let cut: Vec<Frame> = frames.iter().zip(&whole).map(|(&i, f)| f.crop(at(i), (ww, wh))).collect();
+        let cut: Vec<Frame> = frames.iter().map(|&i| self.luminance_frame(i, &masks).crop(at(i), (ww, wh))).collect();
         let starts: Vec<Start> = self
             .starts(frames)
             .into_iter()
@@ -180,13 +194,13 @@ impl Run<'_> {
         .ok_or(Error::Cancelled)?;
         let all = extents.iter().all(|e| *e > SHAKEN);
         let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
-        self.blind = json!({ "method": "joint", "believed": false, "in_doubt": names, "window_px": [x, y, ww, wh], "extent_px": extents });
+        self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": extents });
         Ok(all)
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
     fn patches(&mut self, used: &[usize], from: f32, to: f32) -> Result<Option<Found>> {
-        let (frames, _) = self.luminances(used);
+        let frames = self.luminance_frames(used);
         let times = |k: &usize| self.bracket.frames()[used[*k]].exposure_time;
         let shortest = (0..used.len()).min_by(|a, b| times(a).total_cmp(&times(b))).unwrap_or(0);
         let reference = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)).unwrap_or(shortest);
@@ -230,7 +244,7 @@ impl Run<'_> {
 
     /// The joint estimate.
     fn joint(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
-        let (frames, merged) = self.luminances(used);
+        let (frames, merged) = (self.luminance_frames(used), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used);
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
@@ -270,7 +284,7 @@ impl Run<'_> {
         for (&i, tsf) in used.iter().zip(&found.tsfs) {
             self.motions[i] = tsf.centre();
         }
-        let merged = self.luminances(used).1;
+        let merged = self.blurred_merge(used);
         Ok(Some(Found {
             start: Self::coloured(&merged, &found.luminance),
             tsfs: found.tsfs,

@@ -114,22 +114,14 @@ impl Level {
         let s = DMat3::from_diagonal(DVec3::new(0.5, 0.5, 1.0));
         let variance = frame.weight.map(|w| if w > 0.0 { 1.0 / w } else { f32::INFINITY });
         Self {
-            latent: halve(cropped.as_ref().unwrap_or(frame.latent)),
+            latent: cropped.as_ref().unwrap_or(frame.latent).halved(),
             pad: frame.pad / 2,
-            blurred: halve(frame.blurred),
+            blurred: frame.blurred.halved(),
             // Squared weights of the filter sum to (20/64)² instead of 1: white noise falls, a masked pixel masks all it touches.
-            weight: halve(&variance).map(|v| if v.is_finite() { 1.0 / (v * (20.0f32 / 64.0).powi(2)) } else { 0.0 }),
+            weight: variance.halved().map(|v| if v.is_finite() { 1.0 / (v * (20.0f32 / 64.0).powi(2)) } else { 0.0 }),
             base: s * frame.base * s.inverse(),
         }
     }
-}
-
-/// Half the size through the binomial filter [1 3 3 1]/8, which passes little that the coarser grid cannot hold.
-fn halve(p: &Plane) -> Plane {
-    let (w, h) = (p.width / 2, p.height / 2);
-    let f = [0.125f32, 0.375, 0.375, 0.125];
-    let rows = Plane::from_fn(w, p.height, |x, y| (0..4).map(|k| f[k] * p.clamped(2 * x as isize + k as isize - 1, y as isize)).sum());
-    Plane::from_fn(w, h, |x, y| (0..4).map(|k| f[k] * rows.clamped(x as isize, 2 * y as isize + k as isize - 1)).sum())
 }
 
 fn scaled(tsf: &Tsf, factor: f64) -> Tsf {
