@@ -45,6 +45,16 @@ impl Primaries {
         }
     }
 
+    /// The name of the Color Interop Forum for linear, scene-referred pixels of these primaries.
+    pub fn interop_id(self) -> &'static str {
+        match self {
+            Self::Rec709 => "lin_rec709_scene",
+            Self::Rec2020 => "lin_rec2020_scene",
+            Self::DisplayP3 => "lin_p3d65_scene",
+            Self::AcesCg => "lin_ap1_scene",
+        }
+    }
+
     /// The primaries that `word` names.
     pub fn named(word: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|p| p.name() == word)

@@ -93,8 +93,12 @@ pub fn write_styled(to: impl Write + Seek, image: &Rgb, radiometry: &Radiometry,
         None => format!("1.0 is the white of the reference frame {}: value = irradiance x its {exposure}", ascii(&radiometry.frame)),
     };
     let text = |name: &str, value: &Option<String>| Some((Text::from(name), AttributeValue::Text(words(value)?)));
-    let mut other: Vec<(Text, AttributeValue)> =
-        vec![(FACTOR_ATTRIBUTE.into(), AttributeValue::F32((radiometry.exposure_time / style.absolute.unwrap_or(1.0)) as f32))];
+    let factor = (radiometry.exposure_time / style.absolute.unwrap_or(1.0)) as f32;
+    let mut other: Vec<(Text, AttributeValue)> = vec![
+        (FACTOR_ATTRIBUTE.into(), AttributeValue::F32(factor)),
+        // Programs that pay no heed to chromaticities know this (OpenEXR 3.4).
+        ("colorInteropID".into(), AttributeValue::Text(Text::from(style.primaries.interop_id()))),
+    ];
     other.extend(
         [
             text("cameraMake", &noted.make),

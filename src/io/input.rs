@@ -86,7 +86,8 @@ pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
         return linear(path, file.image, white, file.to_xyz, file.metadata);
     }
     if bytes.starts_with(b"#?") {
-        return linear(path, radiance(&bytes).map_err(refuse)?, white, Primaries::Rec709.to_xyz(), Metadata::default());
+        let (image, to_xyz) = radiance(&bytes).map_err(refuse)?;
+        return linear(path, image, white, to_xyz, Metadata::default());
     }
     let extension = super::output::ending(path);
     #[cfg(feature = "raw")]
@@ -141,8 +142,8 @@ pub fn read_linear(path: &Path) -> Result<Linear> {
     let bytes = super::read_bytes(path)?;
     let refuse = |reason: String| Error::Format { path: path.into(), reason };
     if bytes.starts_with(b"#?") {
-        let image = radiance(&bytes).map_err(refuse)?;
-        return Ok(Linear { image, to_xyz: Primaries::Rec709.to_xyz(), metadata: Metadata::default() });
+        let (image, to_xyz) = radiance(&bytes).map_err(refuse)?;
+        return Ok(Linear { image, to_xyz, metadata: Metadata::default() });
     }
     if bytes.starts_with(b"II") || bytes.starts_with(b"MM") {
         let picture = ldr::decode(path, &bytes)?;
@@ -172,15 +173,27 @@ fn linear(path: &Path, image: Rgb, white: f32, to_xyz: Matrix, metadata: Metadat
     Ok(Input { intensity, levels: ldr::FLOAT_LEVELS, encoding: Encoding::Linear, to_xyz, metadata, raw: false })
 }
 
-/// Pixels of a Radiance HDR file.
-fn radiance(bytes: &[u8]) -> std::result::Result<Rgb, String> {
+/// Pixels of a Radiance HDR file, and their RGB to XYZ relative to D50: by its PRIMARIES, without them Rec. 709, which is what programs
+/// write that write none.
+fn radiance(bytes: &[u8]) -> std::result::Result<(Rgb, Matrix), String> {
     let damaged = |e: ::image::ImageError| format!("is a truncated or damaged Radiance HDR file ({e}); make it again");
     let decoder = ::image::codecs::hdr::HdrDecoder::new(std::io::Cursor::new(bytes)).map_err(damaged)?;
     let (width, height) = ::image::ImageDecoder::dimensions(&decoder);
     super::check_size(width as usize, height as usize, bytes.len())?;
+    let primaries = decoder.metadata().custom_attributes.into_iter().rev().find(|(key, _)| key == "PRIMARIES");
+    let to_xyz = match primaries {
+        None => Primaries::Rec709.to_xyz(),
+        Some((_, text)) => {
+            let numbers: Option<Vec<f64>> = text.split_whitespace().map(|n| n.parse().ok()).collect();
+            let pairs = numbers.filter(|n| n.len() == 8).map(|n| std::array::from_fn(|i| [n[2 * i], n[2 * i + 1]]));
+            pairs
+                .and_then(colour::from_chromaticities)
+                .ok_or("notes PRIMARIES that are not eight numbers, or span no colours; correct or remove that line")?
+        }
+    };
     let picture = ::image::DynamicImage::from_decoder(decoder).map_err(damaged)?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
-    Ok(ldr::planes(&picture.into_rgb32f().into_raw(), width, height, 1.0f32))
+    Ok((ldr::planes(&picture.into_rgb32f().into_raw(), width, height, 1.0f32), to_xyz))
 }
 
 /// Whether two frames' colours are the same to what an eye can tell.

@@ -50,9 +50,15 @@ pub fn write_jpeg(to: impl Write, picture: &RgbImage, quality: u8, noted: Option
 ///
 /// # Errors
 /// What `to` refuses.
-pub fn write_radiance(to: impl Write, image: &Rgb) -> Result<(), String> {
+pub fn write_radiance(mut to: impl Write, image: &Rgb) -> Result<(), String> {
     let pixels: Vec<::image::Rgb<f32>> = (0..image.width() * image.height()).map(|i| ::image::Rgb(image.pixel(i))).collect();
-    ::image::codecs::hdr::HdrEncoder::new(to).encode(&pixels, image.width(), image.height()).map_err(|e| e.to_string())
+    let mut file = Vec::new();
+    ::image::codecs::hdr::HdrEncoder::new(&mut file).encode(&pixels, image.width(), image.height()).map_err(|e| e.to_string())?;
+    // Without this line the format means white of equal energy and another green: colours are 4 % off where that is heeded.
+    let numbers = Primaries::Rec709.chromaticities().concat().iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+    let line = format!("PRIMARIES={numbers}\n");
+    let behind = file.windows(2).position(|w| w == b"\n\n").ok_or("the header has no end")? + 1;
+    [&file[..behind], line.as_bytes(), &file[behind..]].into_iter().try_for_each(|part| to.write_all(part)).map_err(|e| super::plain(&e))
 }
 
 /// Bits of a TIFF file.

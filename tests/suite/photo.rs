@@ -360,6 +360,22 @@ fn linear_files_are_linear_frames() {
         let linear = input::read_linear(&at(name)).unwrap();
         assert!(difference(&in_rec709(&linear.image, &linear.to_xyz), &truth) < 0.02, "{name}");
     }
+    // Radiance HDR means other primaries where it notes none; programs that heed this must find Rec. 709's.
+    let bytes = std::fs::read(at("a.hdr")).unwrap();
+    let line = b"\nPRIMARIES=0.64 0.33 0.3 0.6 0.15 0.06 0.3127 0.329\n\n-Y 30 +X 40\n".as_slice();
+    let behind = bytes.windows(line.len()).position(|w| w == line).unwrap() + line.len();
+    let noting = |primaries: &str| {
+        let header = format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n{primaries}\n-Y 30 +X 40\n");
+        std::fs::write(at("c.hdr"), [header.as_bytes(), &bytes[behind..]].concat()).unwrap();
+        input::read_linear(&at("c.hdr")).map(|l| l.to_xyz)
+    };
+    let wide = noting("PRIMARIES= 0.708 0.292 0.170 0.797 0.131 0.046 0.3127 0.3290\n").unwrap();
+    assert!(input::same_colours(&wide, &Primaries::Rec2020.to_xyz()));
+    assert!(input::same_colours(&noting("").unwrap(), &Primaries::Rec709.to_xyz()));
+    for wrong in ["PRIMARIES=0.7 0.3\n", "PRIMARIES=0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3\n"] {
+        let error = noting(wrong).unwrap_err().to_string();
+        assert!(error.contains("c.hdr") && error.contains("PRIMARIES"), "{error}");
+    }
     // Sixteen bits clip at 1 and tell.
     let style = Style { half: true, ..Style::default() };
     let (staged, clipped) = Output::check(&at("b.tif"), true).unwrap().stage_linear(&truth, &radiometry, &style).unwrap();
@@ -459,7 +475,7 @@ print(json.dumps({
   "confidence": num(c["confidence.Y"].pixels[3, 3]), "chromaticities": [num(v) for v in h["chromaticities"]],
   "expTime": num(h["expTime"]), "aperture": num(h["aperture"]), "isoSpeed": num(h["isoSpeed"]), "capDate": h["capDate"],
   "owner": h["owner"], "whiteLuminance": num(h["whiteLuminance"]), "comments": h["comments"], "latitude": num(h["latitude"]),
-  "compression": str(h["compression"]), "software": h["software"],
+  "compression": str(h["compression"]), "software": h["software"], "interop": h["colorInteropID"],
 }))"#;
     let out = Command::new("python3").args(["-c", script]).arg(&path).output();
     let known = out.as_ref().is_ok_and(|o| !String::from_utf8_lossy(&o.stderr).contains("No module named"));
@@ -487,6 +503,7 @@ print(json.dumps({
     assert!(read["comments"].as_str().unwrap().starts_with("1.0 is the white of the reference frame a.jpg"), "{read}");
     assert!(read["compression"].as_str().unwrap().contains("ZIP_COMPRESSION"), "{read}");
     assert!(read["software"].as_str().unwrap().starts_with("unshaken "), "{read}");
+    assert_eq!(read["interop"], "lin_rec2020_scene", "{read}");
     // And our own reader knows the primaries again.
     let file = exr::read_file(&path).unwrap();
     assert!(
