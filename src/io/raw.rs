@@ -12,11 +12,15 @@ use crate::mask::CLIPPED;
 use rawler::decoders::{Decoder, Orientation, RawDecodeParams, WellKnownIFD};
 use rawler::formats::tiff::Value;
 use rawler::imgop::develop::{Intermediate, ProcessingStep, RawDevelop};
+use rawler::imgop::sensor::xtrans::markesteijn::XTransMarkesteijnDemosaic;
+use rawler::imgop::sensor::{Demosaic, SensorType};
 use rawler::imgop::xyz::Illuminant;
+use rawler::pixarray::{Color2D, PixF32};
 use rawler::rawimage::RawPhotometricInterpretation as Photometric;
 use rawler::rawsource::RawSource;
 use rawler::tags::{DngTag, TiffCommonTag};
 use rawler::{RawImage, RawImageData};
+use rayon::prelude::*;
 use std::cell::Cell;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::Once;
@@ -92,14 +96,26 @@ fn noise_profile(decoder: &dyn Decoder) -> Option<[f64; 2]> {
 
 fn reason(e: &rawler::RawlerError) -> String {
     match e {
+        rawler::RawlerError::Unsupported { what, model, make, .. } if make.trim().is_empty() && model.trim().is_empty() => {
+            let what = printable(what);
+            format!(
+                "is damaged, holds no picture, or is of a kind that is not supported ({what}); copy it again from the camera, or convert it to DNG"
+            )
+        }
         rawler::RawlerError::Unsupported { what, model, make, .. } => {
-            format!("is of a camera that is not supported ({} {}: {}); convert it to DNG", make.trim(), model.trim(), what.trim())
+            let [make, model, what] = [make, model, what].map(|t| printable(t));
+            format!("is of a camera that is not supported ({make} {model}: {what}); convert it to DNG")
         }
         rawler::RawlerError::DecoderFailed(text) => {
-            let text = text.split_whitespace().take(30).collect::<Vec<_>>().join(" ");
-            format!("is truncated or damaged ({text}); copy it again from the camera")
+            format!("is truncated or damaged ({}); copy it again from the camera", printable(text))
         }
     }
+}
+
+/// Words of a damaged file for a terminal: no control characters, and not more than thirty of them.
+fn printable(text: &str) -> String {
+    let plain: String = text.chars().map(|c| if c.is_control() || c == char::REPLACEMENT_CHARACTER { ' ' } else { c }).collect();
+    plain.split_whitespace().take(30).collect::<Vec<_>>().join(" ")
 }
 
 thread_local!(static QUIET: Cell<bool> = const { Cell::new(false) });
@@ -130,6 +146,12 @@ fn complete(mut noted: Metadata, m: &rawler::decoders::RawMetadata) -> Metadata 
     noted.iso = noted.iso.or_else(|| e.iso_speed_ratings.map(f64::from).filter(|v| *v > 0.0 && *v < 65535.0));
     noted.iso = noted.iso.or_else(|| e.iso_speed.map(f64::from).filter(|v| *v > 0.0));
     noted.taken = noted.taken.or_else(|| e.date_time_original.clone());
+    noted.exposure_bias = noted.exposure_bias.or_else(|| {
+        let bias = e.exposure_bias.as_ref().map(|r| f64::from(r.n) / f64::from(r.d));
+        bias.filter(|v| v.abs() <= 40.0)
+    });
+    noted.orientation = noted.orientation.or_else(|| e.orientation.map(u32::from).filter(|v| (1..=8).contains(v)));
+    noted.focal_mm = noted.focal_mm.or_else(|| e.focal_length.as_ref().and_then(positive));
     noted.artist = noted.artist.or_else(|| e.artist.clone());
     noted.copyright = noted.copyright.or_else(|| e.copyright.clone());
     noted.lens = noted.lens.or_else(|| e.lens_model.clone());
@@ -139,7 +161,10 @@ fn complete(mut noted: Metadata, m: &rawler::decoders::RawMetadata) -> Metadata 
     noted
 }
 
-fn develop(mut raw: RawImage, metadata: Metadata) -> Result<Raw, String> {
+fn develop(mut raw: RawImage, mut metadata: Metadata) -> Result<Raw, String> {
+    if raw.fuji_rotation_width.is_some() {
+        return Err("is of a sensor whose rows run diagonally, which is not supported; convert it to 16-bit TIFF".into());
+    }
     match &raw.photometric {
         Photometric::Cfa(c) if c.cfa.is_rgb() => {}
         Photometric::LinearRaw if raw.cpp == 3 => {}
@@ -148,34 +173,75 @@ fn develop(mut raw: RawImage, metadata: Metadata) -> Result<Raw, String> {
         }
         _ => return Err("is monochrome or of an odd kind; convert it to 16-bit TIFF".into()),
     }
-    let white = raw.whitelevel.as_bayer_array();
-    let black = raw.blacklevel.as_bayer_array();
-    if (0..4).any(|i| white[i] <= black[i]) {
-        return Err(format!("notes a white level ({}) that is not above its black level ({}); the file is damaged", white[0], black[0]));
-    }
+    scale(&mut raw)?;
     let to_xyz = camera_matrix(&raw)?;
-    raw.apply_scaling().map_err(|e| reason(&e))?;
-    // Sensor noise lies on both sides of black.
     let saturated = saturated_sites(&raw);
+    let (pixels, reach) = demosaic(&raw)?;
     let crop = raw.crop_area.or(raw.active_area);
-    let (left, top) = crop.map_or((0, 0), |c| (c.p.x, c.p.y));
-    let orientation = raw.orientation;
-    let steps = [ProcessingStep::Demosaic, ProcessingStep::CropActiveArea, ProcessingStep::CropDefault];
-    let developed = RawDevelop::new_with(&steps).develop_intermediate(&raw).map_err(|e| reason(&e))?;
-    let Intermediate::ThreeColor(pixels) = developed else { return Err("has not three colours; convert it to 16-bit TIFF".into()) };
+    let corner = crop.map_or((0, 0), |c| (c.p.x, c.p.y));
     let (width, height) = (pixels.width, pixels.height);
     let data = pixels.into_inner();
     let planes: [Plane; 3] = std::array::from_fn(|c| {
         let mut plane =
             Plane { width, height, data: data.iter().map(|p| if p[c].is_finite() { p[c].clamp(0.0, 1.0) } else { 0.0 }).collect() };
-        spread(&mut plane, &saturated, c as u8, (left, top), raw.width, raw.height);
+        spread(&mut plane, &saturated, c as u8, corner, (raw.width, raw.height), reach);
         plane
     });
-    let intensity = match orientation {
-        Orientation::Unknown => Rgb(planes),
-        o => super::upright(&Rgb(planes), u32::from(o.to_u16())),
+    // Of most formats the decoder leaves the orientation to the notes, which are applied here.
+    let noted = metadata.orientation.take().unwrap_or(1);
+    let orientation = match raw.orientation {
+        Orientation::Unknown | Orientation::Normal => noted,
+        o => u32::from(o.to_u16()),
     };
+    let intensity = super::upright(&Rgb(planes), orientation);
     Ok(Raw { intensity, to_xyz, metadata })
+}
+
+/// Pixel values become 0 at black, 1 at white; what noise pushes below black is 0.
+fn scale(raw: &mut RawImage) -> Result<(), String> {
+    let (black, white) = (raw.blacklevel.as_vec(), raw.whitelevel.as_vec());
+    let (wide, high) = (raw.blacklevel.width.max(1), raw.blacklevel.height.max(1));
+    let (columns, samples) = (raw.width, raw.cpp);
+    // Levels are of single sites, of the four sites of 2 x 2, of colours, or of all.
+    let levels = |x: usize, y: usize, c: usize| {
+        let low = black.get(samples * (wide * (y % high) + x % wide) + c).or(black.first()).copied().unwrap_or(0.0);
+        let place = if samples == 1 && white.len() == 4 { 2 * (y % 2) + x % 2 } else { c };
+        (low, white.get(place).or(white.first()).copied().unwrap_or(0.0))
+    };
+    let mut places = (0..high.max(2)).flat_map(|y| (0..wide.max(2)).map(move |x| (x, y)));
+    let sound = |(low, top): &(f32, f32)| top > low;
+    if let Some((low, top)) = places.find_map(|(x, y)| (0..samples).map(|c| levels(x, y, c)).find(|l| !sound(l))) {
+        return Err(format!("notes a white level ({top}) that is not above its black level ({low}); the file is damaged"));
+    }
+    let mut pixels = raw.data.as_f32().into_owned();
+    pixels.par_chunks_mut((columns * samples).max(1)).enumerate().for_each(|(y, row)| {
+        for (i, v) in row.iter_mut().enumerate() {
+            let (low, top) = levels(i / samples, y, i % samples);
+            *v = ((*v - low) / (top - low)).max(0.0);
+        }
+    });
+    raw.data = RawImageData::Float(pixels);
+    Ok(())
+}
+
+/// The three colours of each pixel of the cropped frame, and how many sites away from a saturated one they are not to be trusted.
+fn demosaic(raw: &RawImage) -> Result<(Color2D<f32, 3>, usize), String> {
+    if let Photometric::Cfa(config) = &raw.photometric
+        && config.sensor == SensorType::Xtrans
+    {
+        // The decoder's own choice for X-Trans is the mean over 5 x 5 sites: a blur that no motion explains.
+        let sites = PixF32::new_with(raw.data.as_f32().into_owned(), raw.width, raw.height);
+        let area = raw.active_area.unwrap_or_else(|| sites.rect());
+        let pixels = XTransMarkesteijnDemosaic::new_pass_3().demosaic(&sites, &config.cfa, &config.colors, area);
+        let crop = raw.crop_area.unwrap_or(area);
+        let inside = crop.adapt(&area);
+        return Ok((if inside.d == pixels.dim() { pixels } else { pixels.crop(inside) }, 2));
+    }
+    let steps = [ProcessingStep::Demosaic, ProcessingStep::CropActiveArea, ProcessingStep::CropDefault];
+    match RawDevelop::new_with(&steps).develop_intermediate(raw).map_err(|e| reason(&e))? {
+        Intermediate::ThreeColor(pixels) => Ok((pixels, 1)),
+        _ => Err("has not three colours; convert it to 16-bit TIFF".into()),
+    }
 }
 
 /// For each site of the sensor, a bit for each channel that it records and that is saturated there.
@@ -190,13 +256,13 @@ fn saturated_sites(raw: &RawImage) -> Vec<u8> {
     }
 }
 
-/// Sets pixels within one site of a saturated site of channel `c` to 1: what was interpolated from clipped values is not a measurement.
-fn spread(plane: &mut Plane, saturated: &[u8], c: u8, (left, top): (usize, usize), width: usize, height: usize) {
+/// Sets pixels within `reach` sites of a saturated site of channel `c` to 1: what was interpolated from clipped values is not a measurement.
+fn spread(plane: &mut Plane, saturated: &[u8], c: u8, corner: (usize, usize), (width, height): (usize, usize), reach: usize) {
     for y in 0..plane.height {
         for x in 0..plane.width {
-            let (i, j) = (x + left, y + top);
-            let hit = (j.saturating_sub(1)..(j + 2).min(height))
-                .any(|b| (i.saturating_sub(1)..(i + 2).min(width)).any(|a| saturated[b * width + a] >> c & 1 == 1));
+            let (i, j) = (x + corner.0, y + corner.1);
+            let hit = (j.saturating_sub(reach)..(j + reach + 1).min(height))
+                .any(|b| (i.saturating_sub(reach)..(i + reach + 1).min(width)).any(|a| saturated[b * width + a] >> c & 1 == 1));
             if hit {
                 plane.data[y * plane.width + x] = 1.0;
             }

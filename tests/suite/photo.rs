@@ -2,6 +2,7 @@
 
 use crate::support::files::{scene, shared};
 use crate::support::photos::{self, Notes};
+use crate::support::raws;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use tempfile::tempdir;
@@ -89,6 +90,63 @@ fn raw_saturation_masks_and_orientation_turns() {
     }
 }
 
+/// Rows and columns come in pairs, but a picture need not.
+#[test]
+fn the_last_row_and_column_of_odd_raw_frames_are_like_the_others() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.dng");
+    std::fs::write(&path, photos::dng(&Rgb::filled(41, 25, 0.3), &Notes::default())).unwrap();
+    let frame = input::read(&path, 1.0).unwrap().intensity;
+    assert_eq!(frame.size(), (41, 25));
+    for c in 0..3 {
+        let wanted = 0.3 * photos::NEUTRAL[c] as f32;
+        let wrong = frame.0[c].data.iter().position(|v| (v - wanted).abs() > 1e-3);
+        assert_eq!(wrong.map(|i| (c, i % 41, i / 41, frame.0[c].data[i])), None);
+    }
+}
+
+#[test]
+fn formats_of_makers_come_upright_in_true_colours() {
+    let dir = tempdir().unwrap();
+    type Write = fn(&Rgb, &Notes) -> Vec<u8>;
+    for (name, write, sensor) in [("a.nef", raws::nef as Write, raws::NIKON), ("a.raf", raws::raf, raws::FUJI)] {
+        let path = dir.path().join(name);
+        let read = |scene: &Rgb, orientation| {
+            std::fs::write(&path, write(scene, &Notes { orientation, ..Notes::default() })).unwrap();
+            input::read(&path, 1.0).unwrap()
+        };
+        let truth = colours(96, 72);
+        let frame = read(&truth, 1);
+        assert_eq!((&frame.encoding, frame.raw, frame.intensity.size()), (&Encoding::Linear, true, (96, 72)), "{name}");
+        let seen: Vec<[f64; 3]> = (0..96 * 72).map(|i| sensor.sees(truth.pixel(i))).collect();
+        let camera = Rgb(std::array::from_fn(|c| Plane::from_fn(96, 72, |x, y| seen[96 * y + x][c] as f32)));
+        let off = difference(&frame.intensity, &camera);
+        assert!(off < 0.04, "{name}: camera RGB is off by {off:.3}");
+        let off = difference(&in_rec709(&frame.intensity, &frame.to_xyz), &truth);
+        assert!(off < 0.06, "{name}: Rec. 709 is off by {off:.3}");
+        let m = &frame.metadata;
+        assert_eq!((m.exposure_time, m.f_number, m.iso), (Some(0.125), Some(5.6), Some(200.0)), "{name}");
+        // The camera was turned: top left of the sensor becomes top right.
+        let turned = read(&truth, 6).intensity;
+        assert_eq!(turned.size(), (72, 96), "{name}");
+        for (x, y) in [(0, 0), (5, 7), (95, 71)] {
+            assert_eq!(turned.0[1].at(71 - y, x), frame.intensity.0[1].at(x, y), "{name}");
+        }
+        // Green saturates in a bright disc, red does not: its filter lets half as much through.
+        let disc = Plane::from_fn(96, 72, |x, y| if (x as f32 - 50.0).hypot(y as f32 - 36.0) < 8.0 { 1.5 } else { 0.1 });
+        let bright = read(&Rgb([disc.clone(), disc.clone(), disc]), 1).intensity;
+        assert!(bright.0[1].at(50, 36) == 1.0 && (bright.0[0].at(50, 36) - 0.75).abs() < 0.01, "{name}");
+        assert!(bright.0.iter().all(|p| p.at(20, 20) < 0.2), "{name}");
+        // A grey edge stays one: what 5 x 5 sites have in common would not be.
+        let step = Plane::from_fn(96, 72, |x, _| if x < 48 { 0.1 } else { 0.6 });
+        let edge = read(&Rgb([step.clone(), step.clone(), step]), 1).intensity;
+        for (x, level) in [(45, 0.1), (46, 0.1), (49, 0.6), (50, 0.6)] {
+            let green = edge.0[1].at(x, 36);
+            assert!((green / level - 1.0).abs() < 0.05, "{name}: {green} at column {x}");
+        }
+    }
+}
+
 #[test]
 fn raw_files_that_cannot_be_developed_are_refused() {
     let dir = tempdir().unwrap();
@@ -102,6 +160,11 @@ fn raw_files_that_cannot_be_developed_are_refused() {
         let text = error(bytes);
         assert!(text.contains("a.dng") && (text.contains("copy it again") || text.contains("DNG")) && text.lines().count() == 1, "{text}");
     }
+    assert!(error(b"nothing").contains("of a kind that is not supported (No decoder found)"), "{}", error(b"nothing"));
+    let diagonal = dir.path().join("a.raf");
+    std::fs::write(&diagonal, raws::raf_of("FinePix S5600", &colours(96, 72), &Notes::default())).unwrap();
+    let text = input::read(&diagonal, 1.0).map(|i| i.intensity.size()).unwrap_err().to_string();
+    assert!(text.contains("a.raf") && text.contains("diagonally") && text.contains("convert it to 16-bit TIFF"), "{text}");
     // No DNG, and of a make that nobody knows.
     let mut foreign = whole.clone();
     let version = whole.windows(4).position(|w| w == [0x12, 0xC6, 1, 0]).unwrap();

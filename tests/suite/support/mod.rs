@@ -3,6 +3,7 @@
 pub mod files;
 pub mod gpu;
 pub mod photos;
+pub mod raws;
 
 use unshaken::image::Plane;
 

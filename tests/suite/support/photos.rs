@@ -64,6 +64,16 @@ impl Notes {
         all
     }
 
+    /// Time, aperture, speed and date, as entries of an EXIF directory.
+    pub fn exposure(&self, t: &Tiff) -> Vec<Entry> {
+        let mut entries = Vec::new();
+        entries.extend(self.time.map(|(a, b)| (33434, t.ratios(5, &[(i64::from(a), i64::from(b))]))));
+        entries.extend(self.f_number.map(|(a, b)| (33437, t.ratios(5, &[(i64::from(a), i64::from(b))]))));
+        entries.extend(self.iso.map(|s| (34855, t.short(&[s]))));
+        entries.extend(self.taken.map(|d| (36867, t.text(d))));
+        entries
+    }
+
     /// An EXIF block.
     pub fn exif(&self) -> Vec<u8> {
         let fields = self.fields();
@@ -83,6 +93,66 @@ pub fn write_jpeg(path: &Path, picture: &image::RgbImage, notes: &Notes) {
     picture.write_with_encoder(encoder).unwrap();
 }
 
+/// Tag, and kind, count and bytes of its value.
+pub type Entry = (u16, (u16, u32, Vec<u8>));
+
+/// Directories of TIFF files in either byte order.
+pub struct Tiff {
+    pub big: bool,
+}
+
+impl Tiff {
+    fn two(&self, v: u16) -> [u8; 2] {
+        if self.big { v.to_be_bytes() } else { v.to_le_bytes() }
+    }
+
+    fn four(&self, v: u32) -> [u8; 4] {
+        if self.big { v.to_be_bytes() } else { v.to_le_bytes() }
+    }
+
+    pub fn short(&self, v: &[u16]) -> (u16, u32, Vec<u8>) {
+        (3, v.len() as u32, v.iter().flat_map(|v| self.two(*v)).collect())
+    }
+
+    pub fn long(&self, v: u32) -> (u16, u32, Vec<u8>) {
+        (4, 1, self.four(v).to_vec())
+    }
+
+    pub fn bytes(&self, v: &[u8]) -> (u16, u32, Vec<u8>) {
+        (1, v.len() as u32, v.to_vec())
+    }
+
+    pub fn text(&self, t: &str) -> (u16, u32, Vec<u8>) {
+        (2, t.len() as u32 + 1, [t.as_bytes(), &[0]].concat())
+    }
+
+    /// Fractions, of kind 5 or 10.
+    pub fn ratios(&self, kind: u16, v: &[(i64, i64)]) -> (u16, u32, Vec<u8>) {
+        (kind, v.len() as u32, v.iter().flat_map(|(a, b)| [self.four(*a as u32), self.four(*b as u32)].concat()).collect())
+    }
+
+    /// One directory that lies at `at`, and behind it what does not fit into its entries.
+    pub fn directory(&self, entries: &[Entry], at: u32) -> Vec<u8> {
+        let (mut table, mut more) = (self.two(entries.len() as u16).to_vec(), Vec::new());
+        let behind = at + 2 + 12 * entries.len() as u32 + 4;
+        for (tag, (kind, count, data)) in entries {
+            table.extend(self.two(*tag));
+            table.extend(self.two(*kind));
+            table.extend(self.four(*count));
+            if data.len() <= 4 {
+                table.extend([data.as_slice(), &[0; 4]].concat()[..4].iter());
+            } else {
+                table.extend(self.four(behind + more.len() as u32));
+                more.extend(data);
+                more.resize(more.len().next_multiple_of(2), 0);
+            }
+        }
+        table.extend([0; 4]);
+        table.extend(more);
+        table
+    }
+}
+
 /// What the camera of [`dng`] sees of white: its sensor is less sensitive to red and blue.
 pub const NEUTRAL: [f64; 3] = [0.5, 1.0, 0.625];
 pub const BLACK: f64 = 512.0;
@@ -100,84 +170,50 @@ pub fn dng(scene: &Rgb, notes: &Notes) -> Vec<u8> {
             pixels.extend((value.round().clamp(0.0, WHITE) as u16).to_le_bytes());
         }
     }
+    let t = Tiff { big: false };
     // XYZ of D65 to Rec. 709 (IEC 61966-2-1).
     let matrix: [f64; 9] = [3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570];
-    let short = |v: &[u16]| (3u16, v.len() as u32, v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>());
-    let long = |v: u32| (4u16, 1u32, v.to_le_bytes().to_vec());
-    let bytes = |v: &[u8]| (1u16, v.len() as u32, v.to_vec());
-    let text = |t: &str| (2u16, t.len() as u32 + 1, [t.as_bytes(), &[0]].concat());
-    let ratios = |kind: u16, v: &[(i64, i64)]| {
-        (
-            kind,
-            v.len() as u32,
-            v.iter().flat_map(|(a, b)| [(*a as u32).to_le_bytes(), (*b as u32).to_le_bytes()].concat()).collect::<Vec<u8>>(),
-        )
-    };
     let ten_thousandths = |v: &[f64]| v.iter().map(|v| ((v * 10_000.0).round() as i64, 10_000)).collect::<Vec<_>>();
-    let mut exif = Vec::new();
-    exif.extend(notes.time.map(|(a, b)| (33434u16, ratios(5, &[(i64::from(a), i64::from(b))]))));
-    exif.extend(notes.f_number.map(|(a, b)| (33437, ratios(5, &[(i64::from(a), i64::from(b))]))));
-    exif.extend(notes.iso.map(|s| (34855, short(&[s]))));
-    exif.extend(notes.taken.map(|t| (36867, text(t))));
+    let exif = notes.exposure(&t);
     let mut main = vec![
-        (254u16, long(0)),
-        (256, long(w as u32)),
-        (257, long(h as u32)),
-        (258, short(&[16])),
-        (259, short(&[1])),
-        (262, short(&[32803])),
-        (271, text("Maker")),
-        (272, text("Model 1")),
-        (273, long(0)),
-        (274, short(&[notes.orientation])),
-        (277, short(&[1])),
-        (278, long(h as u32)),
-        (279, long(pixels.len() as u32)),
-        (284, short(&[1])),
-        (33421, short(&[2, 2])),
-        (33422, bytes(&[0, 1, 1, 2])),
-        (34665, long(0)),
-        (50706, bytes(&[1, 4, 0, 0])),
-        (50708, text("Maker Model 1")),
-        (50714, short(&[BLACK as u16])),
-        (50717, short(&[WHITE as u16])),
-        (50721, ratios(10, &ten_thousandths(&matrix))),
-        (50728, ratios(5, &ten_thousandths(&NEUTRAL))),
-        (50778, short(&[21])),
+        (254u16, t.long(0)),
+        (256, t.long(w as u32)),
+        (257, t.long(h as u32)),
+        (258, t.short(&[16])),
+        (259, t.short(&[1])),
+        (262, t.short(&[32803])),
+        (271, t.text("Maker")),
+        (272, t.text("Model 1")),
+        (273, t.long(0)),
+        (274, t.short(&[notes.orientation])),
+        (277, t.short(&[1])),
+        (278, t.long(h as u32)),
+        (279, t.long(pixels.len() as u32)),
+        (284, t.short(&[1])),
+        (33421, t.short(&[2, 2])),
+        (33422, t.bytes(&[0, 1, 1, 2])),
+        (34665, t.long(0)),
+        (50706, t.bytes(&[1, 4, 0, 0])),
+        (50708, t.text("Maker Model 1")),
+        (50714, t.short(&[BLACK as u16])),
+        (50717, t.short(&[WHITE as u16])),
+        (50721, t.ratios(10, &ten_thousandths(&matrix))),
+        (50728, t.ratios(5, &ten_thousandths(&NEUTRAL))),
+        (50778, t.short(&[21])),
     ];
-    main.extend(notes.artist.map(|a| (315, text(a))));
+    main.extend(notes.artist.map(|a| (315, t.text(a))));
     main.extend(
         notes.noise.as_ref().map(|v| (51041, (12u16, v.len() as u32, v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()))),
     );
     main.sort_by_key(|t| t.0);
-    type Entry = (u16, (u16, u32, Vec<u8>));
-    let directory = |entries: &[Entry], at: u32| {
-        let (mut table, mut more) = ((entries.len() as u16).to_le_bytes().to_vec(), Vec::new());
-        let behind = at + 2 + 12 * entries.len() as u32 + 4;
-        for (tag, (kind, count, data)) in entries {
-            table.extend(tag.to_le_bytes());
-            table.extend(kind.to_le_bytes());
-            table.extend(count.to_le_bytes());
-            if data.len() <= 4 {
-                table.extend([data.as_slice(), &[0; 4]].concat()[..4].iter());
-            } else {
-                table.extend((behind + more.len() as u32).to_le_bytes());
-                more.extend(data);
-                more.resize(more.len().next_multiple_of(2), 0);
-            }
-        }
-        table.extend(0u32.to_le_bytes());
-        table.extend(more);
-        table
-    };
-    let exif_at = 8 + directory(&main, 8).len() as u32;
-    let pixels_at = exif_at + directory(&exif, exif_at).len() as u32;
+    let exif_at = 8 + t.directory(&main, 8).len() as u32;
+    let pixels_at = exif_at + t.directory(&exif, exif_at).len() as u32;
     for (tag, value) in [(273, pixels_at), (34665, exif_at)] {
-        main.iter_mut().find(|e| e.0 == tag).unwrap().1 = long(value);
+        main.iter_mut().find(|e| e.0 == tag).unwrap().1 = t.long(value);
     }
     let mut file = b"II*\0\x08\0\0\0".to_vec();
-    file.extend(directory(&main, 8));
-    file.extend(directory(&exif, exif_at));
+    file.extend(t.directory(&main, 8));
+    file.extend(t.directory(&exif, exif_at));
     file.extend(pixels);
     file
 }
