@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let gpu = Gpu::new()?;
     println!("{}", gpu.description);
     for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
-        let kernels = Kernels::new(&gpu, interpolation);
+        let kernels = Kernels::new(&gpu);
         for entry in &file.frames {
             let tsf = Tsf::new(entry.focal_px, entry.poses.clone())?;
             if tsf.is_identity() {
@@ -30,12 +30,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 taps.bases.len(),
                 taps.taps.len()
             );
-            let blur = Blur::new(&gpu, &kernels.blur, &taps, size, pad);
+            let blur = Blur::new(&gpu, kernels.blur(&gpu, interpolation), &taps, size, pad);
             let scratch = Scratch::new(&gpu, blur.scratch_wanted())?;
             let latent = channels(&gpu, "latent", (size.0 + 2 * pad) * (size.1 + 2 * pad))?;
             let frame = channels(&gpu, "frame", size.0 * size.1)?;
-            let forward = blur.forward(&gpu, &kernels.blur, &scratch, &latent, &frame);
-            let adjoint = blur.adjoint(&gpu, &kernels.blur, &scratch, &frame, &latent, 1.0);
+            let forward = blur.forward(&gpu, kernels.blur(&gpu, interpolation), &scratch, &latent, &frame);
+            let adjoint = blur.adjoint(&gpu, kernels.blur(&gpu, interpolation), &scratch, &frame, &latent, 1.0);
             for (name, steps) in [("K", forward), ("Kᵀ", adjoint)] {
                 for (i, step) in steps.iter().enumerate() {
                     gpu.submit(std::slice::from_ref(step));

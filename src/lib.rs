@@ -16,6 +16,7 @@
 pub mod baseline;
 pub mod blind;
 pub mod cli;
+pub mod collaborative;
 pub mod colour;
 pub mod deblur;
 pub mod error;

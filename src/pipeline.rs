@@ -1,6 +1,6 @@
 //! The stages in order: a bracket in, irradiance and report out. No mathematics, no files, no printing.
 
-use crate::deblur::{self, Observation, Solution};
+use crate::deblur::{self, Observation, Prior, Solution};
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
 use crate::gpu::Gpu;
@@ -228,7 +228,7 @@ pub fn merge_with(
     let frames = bracket.frames();
     let excluded = check(bracket, settings)?;
     let stop = engine.stop.clone();
-    let (gpu, kernels, memo) = engine.parts(settings.deblur.interpolation);
+    let (gpu, kernels, memo) = engine.parts();
     let start = Instant::now();
     // TSFs that are given decide about every stage.
     memo.begin(if given.is_some() { None } else { Some(format!("{name} {:?}", settings.noise)) });
@@ -962,7 +962,7 @@ impl Run<'_> {
 /// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.
 fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
     let standard = deblur::Settings::default();
-    deblur::Settings { lambda: standard.lambda, robust: standard.robust, ..settings.clone() }
+    deblur::Settings { lambda: standard.lambda, prior: Prior::Tv, robust: standard.robust, ..settings.clone() }
 }
 
 /// Displacement in pixels of a blurred frame that the search for its poses covers by itself.

@@ -59,14 +59,14 @@ fn noise(seed: u32) -> Vec<f32> {
 impl Device {
     fn new(taps: &TapSet, image: &[Vec<f32>; 3]) -> Self {
         let gpu = Gpu::new().expect("an adapter");
-        let kernels = Kernels::new(&gpu, Interpolation::Bilinear);
-        let blur = Blur::new(&gpu, &kernels.blur, taps, (SIDE, SIDE), 0);
+        let kernels = Kernels::new(&gpu);
+        let blur = Blur::new(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), taps, (SIDE, SIDE), 0);
         let scratch = Scratch::new(&gpu, blur.scratch_wanted()).expect("memory");
         let latent = image.each_ref().map(|c| gpu.upload("latent", c).expect("memory"));
         let frame = channels(&gpu, "frame", SIDE * SIDE).expect("memory");
         let back = channels(&gpu, "back", SIDE * SIDE).expect("memory");
-        let forward = blur.forward(&gpu, &kernels.blur, &scratch, &latent, &frame);
-        let adjoint = blur.adjoint(&gpu, &kernels.blur, &scratch, &latent, &back, 1.0);
+        let forward = blur.forward(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &latent, &frame);
+        let adjoint = blur.adjoint(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &latent, &back, 1.0);
         Self { gpu, frame, back, forward, adjoint }
     }
 
@@ -159,7 +159,7 @@ fn main() {
 
     // An iteration: the difference between long and short solves.
     let (observation, start) = observation(&taps, &image);
-    let kernels = Kernels::new(&device.gpu, Interpolation::Bilinear);
+    let kernels = Kernels::new(&device.gpu);
     let solve = |inner: usize| {
         let settings = Settings { outer: 1, inner, ..Settings::default() };
         time(|| drop(deblur::solve(&device.gpu, &kernels, std::slice::from_ref(&observation), &start, 0, &settings, &mut |_| true)))

@@ -36,7 +36,7 @@ pub fn deblur_each(
     let masks = mask::masks(frames, &vec![false; frames.len()], 0.0, &vec![DMat3::IDENTITY; frames.len()]);
     let shaken: Vec<usize> = (0..frames.len()).filter(|&i| !tsfs[i].is_identity()).collect();
     let gpu = Gpu::new()?;
-    let kernels = Kernels::new(&gpu, settings.interpolation);
+    let kernels = Kernels::new(&gpu);
     let mut restored: Vec<Frame> = frames.to_vec();
     for (k, &i) in shaken.iter().enumerate() {
         let pad = deblur::pad_for(&[&tsfs[i]], width, height, width.max(height) / 6);

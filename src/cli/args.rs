@@ -109,7 +109,10 @@ pub(super) struct MergeArgs {
     /// Largest reach in pixels of the local blurs (PSFs) that the report shows [default: as far as the camera's motion takes the place]
     #[arg(long, value_name = "R", allow_hyphen_values = true)]
     pub psf_radius: Option<String>,
-    /// Weight of the smoothness (total variation of log irradiance): more is smoother and less noisy [default: 2.5]
+    /// What the picture is taken to look like: collaborative (patches that look alike are freed of noise together), tv (few edges: total variation alone)
+    #[arg(long, value_name = "PRIOR", value_parser = ["collaborative", "tv"], default_value = "collaborative")]
+    pub prior: String,
+    /// Weight of the smoothness: more is smoother and less noisy [default: 2.5]
     #[arg(long, value_name = "L", allow_hyphen_values = true)]
     pub lambda: Option<String>,
     /// How much a shaken frame loses weight where its blur does not explain it: 0 (trusted everywhere) and more [default: 1]
@@ -118,9 +121,9 @@ pub(super) struct MergeArgs {
     /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
-    /// Interpolation of the warps
-    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bilinear")]
-    pub interpolation: String,
+    /// Interpolation of the blurred frames' warps [default: bilinear, without a sharp frame bicubic]
+    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"])]
+    pub interpolation: Option<String>,
     /// When no frame is sharp: auto (all blurs and the scene together; also when frames only pass for sharp and all turn out to have moved), joint (so whatever passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: auto]
     #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,

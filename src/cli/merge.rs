@@ -4,6 +4,7 @@ use super::args::MergeArgs;
 use super::progress::done;
 use super::{Done, Usage, frames, interrupt, page, with_progress};
 use crate::colour::{self, Matrix, Primaries};
+use crate::deblur::Prior;
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::io::exr::{self, Radiometry};
@@ -338,6 +339,7 @@ impl PhotoSettings {
             ("--no-align".into(), set(args.no_align)),
             ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
+            ("--prior".into(), args.prior.clone()),
             ("--lambda".into(), or(&args.lambda, "2.5")),
             ("--robust".into(), or(&args.robust, "1")),
         ]
@@ -435,11 +437,12 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         settings.deblur.robust = robust;
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
-    settings.deblur.interpolation = match args.interpolation.as_str() {
+    settings.deblur.prior = if args.prior == "tv" { Prior::Tv } else { Prior::Collaborative };
+    settings.deblur.interpolation = args.interpolation.as_deref().map(|word| match word {
         "bicubic" => Interpolation::Bicubic,
         "six-point" => Interpolation::SixPoint,
         _ => Interpolation::Bilinear,
-    };
+    });
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
     settings.blind = blind(args.blind.as_deref())?;
     if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {

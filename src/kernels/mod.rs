@@ -12,6 +12,7 @@ pub use linear::{LinearKernels, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMO
 
 use crate::gpu::Gpu;
 use crate::tsf::Interpolation;
+use std::sync::OnceLock;
 
 /// Three buffers of one size: red, green, blue.
 pub type Channels = [wgpu::Buffer; 3];
@@ -30,10 +31,8 @@ pub const STILL: Interpolation = Interpolation::SixPoint;
 
 /// All kernels, compiled once per device.
 pub struct Kernels {
-    /// K and Kᵀ.
-    pub blur: BlurKernels,
-    /// The same for sharp frames that are displaced.
-    pub still: BlurKernels,
+    /// K and Kᵀ, by the half-width of the interpolation.
+    blur: [OnceLock<BlurKernels>; 3],
     /// Data weights and residuals.
     pub data: DataKernels,
     /// Smoothness and conjugate gradients.
@@ -41,14 +40,14 @@ pub struct Kernels {
 }
 
 impl Kernels {
-    /// Compiles everything; warps of blurred frames use `interpolation`, those of sharp ones [`STILL`].
-    pub fn new(gpu: &Gpu, interpolation: Interpolation) -> Self {
-        Self {
-            blur: BlurKernels::new(gpu, interpolation),
-            still: BlurKernels::new(gpu, STILL),
-            data: DataKernels::new(gpu),
-            linear: LinearKernels::new(gpu),
-        }
+    /// Compiles everything but K and Kᵀ.
+    pub fn new(gpu: &Gpu) -> Self {
+        Self { blur: [const { OnceLock::new() }; 3], data: DataKernels::new(gpu), linear: LinearKernels::new(gpu) }
+    }
+
+    /// K and Kᵀ under `interpolation`, compiled when first asked for.
+    pub fn blur(&self, gpu: &Gpu, interpolation: Interpolation) -> &BlurKernels {
+        self.blur[interpolation.support() - 1].get_or_init(|| BlurKernels::new(gpu, interpolation))
     }
 }
 

@@ -4,7 +4,6 @@ use crate::gpu::Gpu;
 use crate::image::Rgb;
 use crate::kernels::Kernels;
 use crate::noise::NoiseModel;
-use crate::tsf::Interpolation;
 use std::any::Any;
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -18,7 +17,7 @@ const ROOM: usize = 3 << 30;
 /// The device, its kernels, and what earlier merges found out.
 pub struct Engine {
     gpu: Gpu,
-    kernels: Option<(Interpolation, Kernels)>,
+    kernels: Option<Kernels>,
     memo: Memo,
     pub(super) stop: Option<Arc<AtomicBool>>,
 }
@@ -59,11 +58,8 @@ impl Engine {
         self.memo.ran.clear();
     }
 
-    pub(super) fn parts(&mut self, interpolation: Interpolation) -> (&Gpu, &Kernels, &mut Memo) {
-        if self.kernels.as_ref().is_none_or(|k| k.0 != interpolation) {
-            self.kernels = Some((interpolation, Kernels::new(&self.gpu, interpolation)));
-        }
-        let kernels = &self.kernels.as_ref().expect("made above").1;
+    pub(super) fn parts(&mut self) -> (&Gpu, &Kernels, &mut Memo) {
+        let kernels = self.kernels.get_or_insert_with(|| Kernels::new(&self.gpu));
         (&self.gpu, kernels, &mut self.memo)
     }
 }

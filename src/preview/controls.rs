@@ -169,7 +169,12 @@ fn parameters(app: &mut App, ui: &mut egui::Ui) {
     let p = &mut app.session.parameters;
     ui.checkbox(&mut app.live, "Solve after each edit");
     ui.add(Slider::new(&mut p.lambda, 0.1..=20.0).logarithmic(true).text("Smoothness, lambda").max_decimals(2))
-        .on_hover_text("Weight of the total variation: more is smoother, less keeps more noise and detail");
+        .on_hover_text("More is smoother, less keeps more noise and detail");
+    egui::ComboBox::from_label("Prior").width(130.0).selected_text(p.prior.clone()).show_ui(ui, |ui| {
+        for (word, text) in [("collaborative", "patches that look alike"), ("tv", "few edges (total variation)")] {
+            ui.selectable_value(&mut p.prior, word.to_string(), format!("{word}: {text}"));
+        }
+    });
     ui.add(Slider::new(&mut p.robust, 0.0..=4.0).text("Robust weights").step_by(0.05))
         .on_hover_text("How much a shaken frame loses weight where its blur does not explain it; 0 trusts it everywhere");
     ui.add(Slider::new(&mut p.alpha, 0.0..=1.0).text("Mask taper, alpha").step_by(0.01));

@@ -46,6 +46,8 @@ impl Shot {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Parameters {
+    /// `--prior`.
+    pub prior: String,
     /// `--lambda`.
     pub lambda: f32,
     /// `--robust`.
@@ -74,6 +76,7 @@ impl Default for Parameters {
     fn default() -> Self {
         let merge = crate::pipeline::Settings::default();
         Self {
+            prior: "collaborative".into(),
             lambda: merge.deblur.lambda,
             robust: merge.deblur.robust,
             alpha: merge.alpha,
@@ -182,6 +185,7 @@ impl Session {
         differs("alpha", p.alpha.to_string(), usual.alpha.to_string());
         differs("model", p.model.clone(), usual.model);
         differs("psf-radius", p.psf_radius.to_string(), usual.psf_radius.to_string());
+        differs("prior", p.prior.clone(), usual.prior);
         differs("lambda", p.lambda.to_string(), usual.lambda.to_string());
         differs("robust", p.robust.to_string(), usual.robust.to_string());
         differs("blind", p.blind.clone(), usual.blind);

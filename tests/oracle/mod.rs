@@ -2,6 +2,7 @@
 //! where it uses closed forms, dense algebra where it iterates. Slow and plain; knows nothing of `unshaken::kernels`.
 
 pub mod blur;
+pub mod collaborative;
 pub mod data;
 pub mod linear;
 pub mod solver;

@@ -88,7 +88,7 @@ impl Case {
             pad,
             interpolation,
             matrix: blur::of_taps(&taps, interpolation, frame, pad),
-            blur: Blur::new(gpu(), &kernels(interpolation).blur, &taps, frame, pad),
+            blur: Blur::new(gpu(), kernels().blur(gpu(), interpolation), &taps, frame, pad),
             tolerance: tolerance(&taps, frame, interpolation.support()),
         }
     }
@@ -104,14 +104,14 @@ impl Case {
     fn forward(&self, scratch: &Scratch, latent: &Channels) -> [Vec<f32>; 3] {
         let m = self.counts().1;
         let out = [poisoned(m), poisoned(m), poisoned(m)];
-        run(&self.blur.forward(gpu(), &kernels(self.interpolation).blur, scratch, latent, &out));
+        run(&self.blur.forward(gpu(), kernels().blur(gpu(), self.interpolation), scratch, latent, &out));
         out.map(|o| read(&o, m))
     }
 
     /// `start + factor Kᵀ frame`.
     fn adjoint(&self, scratch: &Scratch, frame: &Channels, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
         let out = planes(start);
-        run(&self.blur.adjoint(gpu(), &kernels(self.interpolation).blur, scratch, frame, &out, factor));
+        run(&self.blur.adjoint(gpu(), kernels().blur(gpu(), self.interpolation), scratch, frame, &out, factor));
         out.map(|o| read(&o, self.counts().0))
     }
 
@@ -401,13 +401,13 @@ fn a_pose_is_never_far_from_its_base_warp() {
 #[test]
 fn planes_larger_than_a_binding_are_bound_in_bands() {
     let gpu = unshaken::gpu::Gpu::new().expect("an adapter").with_binding_limit(96 * 1024);
-    let kernels = unshaken::kernels::Kernels::new(&gpu, Interpolation::Bilinear);
+    let kernels = unshaken::kernels::Kernels::new(&gpu);
     let (frame, pad) = ((120, 500), 8);
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
     assert!(m > gpu.max_binding());
     let tsf = Tsf::new(500.0, vec![Pose::planar(0.4, -0.3, -0.4, 0.6), Pose::planar(2.2, 3.8, 0.5, 0.4)]).expect("valid");
     for taps in [TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear), TapSet::direct(&tsf, frame.0, frame.1)] {
-        let blur = Blur::new(&gpu, &kernels.blur, &taps, frame, pad);
+        let blur = Blur::new(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &taps, frame, pad);
         let most = ScratchSize { planes: gpu.max_binding(), copy: gpu.max_binding() };
         let scratch = Scratch::new(&gpu, blur.scratch_wanted().min(most)).expect("fits");
         let upload = |seed: u64, count: usize| -> ([Vec<f32>; 3], Channels) {
@@ -417,8 +417,8 @@ fn planes_larger_than_a_binding_are_bound_in_bands() {
         };
         let ((latent, e), (seen, b)) = (upload(1, n), upload(4, m));
         let ((_, out), (start, back)) = (upload(7, m), upload(10, n));
-        gpu.submit(&blur.forward(&gpu, &kernels.blur, &scratch, &e, &out));
-        gpu.submit(&blur.adjoint(&gpu, &kernels.blur, &scratch, &b, &back, 1.0));
+        gpu.submit(&blur.forward(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &e, &out));
+        gpu.submit(&blur.adjoint(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &b, &back, 1.0));
         let matrix = blur::of_taps(&taps, Interpolation::Bilinear, frame, pad);
         let bound = tolerance(&taps, frame, 1);
         for c in 0..3 {
@@ -438,7 +438,7 @@ fn a_frame_twelve_thousand_pixels_wide_runs_in_one_piece_and_in_bands() {
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
     let tsf = Tsf::new(9000.0, vec![Pose::planar(0.3, -0.2, 0.02, 0.5), Pose::planar(2.3, 3.4, 0.0, 0.5)]).expect("valid");
     let taps = TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear);
-    let kernels = &kernels(Interpolation::Bilinear).blur;
+    let kernels = kernels().blur(gpu(), Interpolation::Bilinear);
     let blur = Blur::new(gpu(), kernels, &taps, frame, pad);
     let (latent, seen) = (planes(&[1, 2, 3].map(|s| noise(s, n))), planes(&[4, 5, 6].map(|s| noise(s, m))));
     let (least, wanted) = (blur.scratch_needed(), blur.scratch_wanted());

@@ -334,6 +334,8 @@ fn a_configuration_holds_every_option_of_merge() {
             "true"
         } else if name == "interpolation" {
             "\"six-point\""
+        } else if name == "prior" {
+            "\"tv\""
         } else {
             "\"7\""
         };

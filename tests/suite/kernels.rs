@@ -13,7 +13,6 @@ use unshaken::kernels::{
     Channels, Kernels, MisfitSource, NOISE_STEPS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, WeightTarget, partials_1d,
     partials_2d,
 };
-use unshaken::tsf::Interpolation;
 
 const HALF_ULP: f64 = 1.0 / (1u64 << 24) as f64;
 const SIZES: [(usize, usize); 8] = [(1, 1), (1, 7), (7, 1), (17, 9), (16, 8), (33, 65), (300, 5), (6001, 3)];
@@ -23,7 +22,7 @@ const COUNTS: [usize; 9] = [1, 2, 127, 128, 129, 1000, 16383, 16384, 16500];
 const MANY: usize = 32768 * 128 + 1003;
 
 fn k() -> &'static Kernels {
-    kernels(Interpolation::Bicubic)
+    kernels()
 }
 
 /// Bound of the error of a sum of these terms, each itself within `each` roundings.

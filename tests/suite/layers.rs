@@ -27,7 +27,8 @@ const TABLE: &[(&str, &[&str])] = &[
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
-    ("deblur", &["error", "image", "pose", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
+    ("collaborative", &["image"]),
+    ("deblur", &["error", "image", "pose", "collaborative", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
     // All stages in order. Of the kernels it only opens the set.
     (
         "pipeline",
@@ -96,6 +97,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "colour",
             "layers",
             "merge::resampled",
+            "deblur::Prior",
             "io",
             "pipeline",
             "metrics",
@@ -278,7 +280,7 @@ fn a_wrong_import_is_found_however_it_is_written() {
         ("gpu", "// use crate::image;\n/// [`crate::deblur::solve`]\nuse crate::error::{Error, Result};"),
         ("kernels", "use crate::tsf::{Interpolation, Tap, TapSet};\nuse crate::gpu::{self, Gpu};"),
         ("synth", "use crate::{error::Result, tsf::{Tsf, TsfFile}, synth::scene};"),
-        ("pipeline", "let k = crate::kernels::Kernels::new(gpu, i);"),
+        ("pipeline", "let k = crate::kernels::Kernels::new(gpu);"),
         ("main", "fn main() { unshaken::cli::main() }"),
     ] {
         assert_eq!(check(module, text), Vec::<String>::new(), "{module}: {text}");

@@ -16,6 +16,8 @@ mod batch;
 mod blind;
 /// The program as a user runs it: outputs, messages, exit codes.
 mod cli;
+/// Collaborative filtering against its oracle, and what it must keep.
+mod collaborative;
 /// The demo's bracket and its before/after picture.
 mod demo;
 /// The paper's experiments, tiny.

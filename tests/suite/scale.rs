@@ -43,7 +43,7 @@ fn bracket() -> Vec<Observation> {
 
 fn run(gpu: &Gpu, kernels: &Kernels, memory_limit: Option<u64>) -> Result<Solution, Error> {
     let start = Rgb::filled(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD, 0.3);
-    let settings = Settings { outer: 2, inner: 5, memory_limit, interpolation: Interpolation::Bilinear, ..Settings::default() };
+    let settings = Settings { outer: 2, inner: 5, memory_limit, interpolation: Some(Interpolation::Bilinear), ..Settings::default() };
     solve(gpu, kernels, &bracket(), &start, PAD, &settings, &mut |_| true)
 }
 
@@ -55,7 +55,7 @@ fn farthest(a: &Rgb, b: &Rgb) -> f32 {
 #[test]
 fn less_memory_gives_the_same_irradiance() {
     let gpu = Gpu::new().expect("an adapter");
-    let kernels = Kernels::new(&gpu, Interpolation::Bilinear);
+    let kernels = Kernels::new(&gpu);
     let all = run(&gpu, &kernels, None).expect("solves");
     let memory = all.report.memory;
     assert!(!memory.streamed && !memory.reduced);
@@ -80,9 +80,9 @@ fn less_memory_gives_the_same_irradiance() {
 
 #[test]
 fn a_device_that_runs_out_of_memory_is_asked_for_less() {
-    let all = run(gpu(), kernels(Interpolation::Bilinear), None).expect("solves");
+    let all = run(gpu(), kernels(), None).expect("solves");
     let small = Gpu::new().expect("an adapter").with_memory_limit(all.report.memory.bytes * 3 / 4);
-    let kernels = Kernels::new(&small, Interpolation::Bilinear);
+    let kernels = Kernels::new(&small);
     let less = run(&small, &kernels, None).expect("solves all the same");
     assert!(less.report.memory.reduced && less.report.memory.bytes < all.report.memory.bytes);
     assert!(farthest(&all.irradiance, &less.irradiance) < 1e-5);
@@ -93,7 +93,7 @@ fn a_device_that_runs_out_of_memory_is_asked_for_less() {
 #[test]
 fn frames_beyond_a_binding_are_refused_with_a_remedy() {
     let narrow = Gpu::new().expect("an adapter").with_binding_limit(100_000);
-    let kernels = Kernels::new(&narrow, Interpolation::Bilinear);
+    let kernels = Kernels::new(&narrow);
     let error = run(&narrow, &kernels, None).err().expect("too large").to_string();
     assert!(error.contains("150 x 110") && error.contains("--scale"), "{error}");
 }

@@ -5,7 +5,7 @@ use crate::oracle::solver::{Frame, Planes, Problem, Weights, advance};
 use crate::support::gpu::{gpu, kernels};
 use crate::support::{f64s, noise};
 use glam::DMat3;
-use unshaken::deblur::{Observation, Settings, Solution, Stop, pad_for, solve};
+use unshaken::deblur::{Observation, Prior, Settings, Solution, Stop, pad_for, solve};
 use unshaken::error::Error;
 use unshaken::image::{Plane, Rgb};
 use unshaken::kernels::NOISE_STEPS;
@@ -86,11 +86,18 @@ fn start(pad: usize) -> Rgb {
 }
 
 fn settings() -> Settings {
-    Settings { lambda: 2.0, epsilon: 0.05, settled: f64::INFINITY, interpolation: INTERPOLATION, ..Settings::default() }
+    Settings {
+        lambda: 2.0,
+        epsilon: 0.05,
+        settled: f64::INFINITY,
+        interpolation: Some(INTERPOLATION),
+        prior: Prior::Tv,
+        ..Settings::default()
+    }
 }
 
 fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Settings) -> Solution {
-    solve(gpu(), kernels(settings.interpolation), observations, initial, pad, settings, &mut |_| true).expect("solves")
+    solve(gpu(), kernels(), observations, initial, pad, settings, &mut |_| true).expect("solves")
 }
 
 fn problem(observations: &[Observation], pad: usize, settings: &Settings) -> Problem {
@@ -271,14 +278,14 @@ fn cancelling_stops_and_progress_rises() {
             seen.push(f);
             true
         };
-        solve(gpu(), kernels(INTERPOLATION), &bracket, &initial, 2, &set, &mut all).expect("solves");
+        solve(gpu(), kernels(), &bracket, &initial, 2, &set, &mut all).expect("solves");
         assert!(seen.len() >= 4 && seen.is_sorted() && seen.iter().all(|f| (0.0..=1.0).contains(f)), "inner {inner}: {seen:?}");
         let mut calls = 0;
         let mut cancel = |_: f32| {
             calls += 1;
             calls < 2
         };
-        let result = solve(gpu(), kernels(INTERPOLATION), &bracket, &initial, 2, &set, &mut cancel);
+        let result = solve(gpu(), kernels(), &bracket, &initial, 2, &set, &mut cancel);
         assert!(matches!(result, Err(Error::Cancelled)), "inner {inner}");
         assert_eq!(calls, 2, "inner {inner}: nothing runs after a refusal");
     }
@@ -345,7 +352,7 @@ fn numbers_that_are_none_are_refused() {
     let refused = |change: &dyn Fn(&mut Vec<Observation>, &mut Rgb)| {
         let (mut observations, mut initial) = (bracket(2), start(2));
         change(&mut observations, &mut initial);
-        let result = solve(gpu(), kernels(INTERPOLATION), &observations, &initial, 2, &settings(), &mut |_| true);
+        let result = solve(gpu(), kernels(), &observations, &initial, 2, &settings(), &mut |_| true);
         matches!(result, Err(Error::Input(_)))
     };
     assert!(!refused(&|_, _| {}));

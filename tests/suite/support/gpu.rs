@@ -3,7 +3,6 @@
 use std::sync::OnceLock;
 use unshaken::gpu::{self, Gpu, Step};
 use unshaken::kernels::{Channels, Kernels};
-use unshaken::tsf::Interpolation;
 
 /// What every output buffer holds before a kernel that overwrites it.
 pub const POISON: f32 = -12345.0;
@@ -14,10 +13,10 @@ pub fn gpu() -> &'static Gpu {
     GPU.get_or_init(|| Gpu::new().unwrap_or_else(|e| panic!("the tests need a GPU adapter: {e}")))
 }
 
-/// The kernels of one interpolation.
-pub fn kernels(interpolation: Interpolation) -> &'static Kernels {
-    static KERNELS: [OnceLock<Kernels>; 3] = [const { OnceLock::new() }; 3];
-    KERNELS[interpolation.support() - 1].get_or_init(|| Kernels::new(gpu(), interpolation))
+/// The kernels.
+pub fn kernels() -> &'static Kernels {
+    static KERNELS: OnceLock<Kernels> = OnceLock::new();
+    KERNELS.get_or_init(|| Kernels::new(gpu()))
 }
 
 /// A buffer that holds `values`.
