@@ -245,7 +245,7 @@ impl Pass<'_> {
         for at in rows.iter().flat_map(|&y| columns.iter().map(move |&x| (x, y))) {
             let places = self.alike(at);
             let variances = self.variances(at);
-            for c in 0..3 {
+            for (c, variance) in variances.iter().enumerate() {
                 let mut transformed = |plane: &Plane| {
                     let mut stack: Vec<Patch> = places.iter().map(|&p| transform(&self.dct, &patch(plane, p))).collect();
                     haar(&mut stack, &mut spare, false);
@@ -253,7 +253,7 @@ impl Pass<'_> {
                 };
                 let mut stack = transformed(&self.noisy.0[c]);
                 let known = self.basic.map_or(Vec::new(), |b| transformed(&b.0[c]));
-                let weight = 1.0 / self.shrink(&mut stack, &known, &variances[c]).max(f32::MIN_POSITIVE);
+                let weight = 1.0 / self.shrink(&mut stack, &known, variance).max(f32::MIN_POSITIVE);
                 haar(&mut stack, &mut spare, true);
                 for (&(x, y), coefficients) in places.iter().zip(&stack) {
                     let p = transform(&self.inverse, coefficients);

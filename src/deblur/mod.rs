@@ -28,8 +28,8 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, BlurKernels, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, STILL, Scratch,
-    ScratchSize, WeightTarget, channels, partials_1d, partials_2d,
+    Blur, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, STILL, Scratch, ScratchSize,
+    WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use memory::{Need, Plan};
@@ -190,19 +190,32 @@ const ITERATING: f32 = 0.95;
 /// Displacement in pixels from which a frame counts as displaced rather than shaken.
 const DISPLACED: f64 = 4.0;
 
-struct Moving {
+/// K of a frame that is not in place.
+struct Operator {
     blur: Blur,
     interpolation: Interpolation,
     still: bool,
     energy: f32,
     power: Patch,
+}
+
+struct Moving {
+    operator: Operator,
     weight: Channels,
     observation: Channels,
 }
 
 impl Moving {
-    fn of<'k>(&self, gpu: &Gpu, kernels: &'k Kernels) -> &'k BlurKernels {
-        kernels.blur(gpu, self.interpolation)
+    /// Steps of `frame = K latent`.
+    fn forward(&self, solver: &Solver, latent: &Channels, frame: &Channels) -> Vec<Step> {
+        let compiled = solver.kernels.blur(solver.gpu, self.operator.interpolation);
+        self.operator.blur.forward(solver.gpu, compiled, &solver.state.scratch, latent, frame)
+    }
+
+    /// Steps of `latent += factor Kᵀ frame`.
+    fn adjoint(&self, solver: &Solver, frame: &Channels, latent: &Channels, factor: f32) -> Vec<Step> {
+        let compiled = solver.kernels.blur(solver.gpu, self.operator.interpolation);
+        self.operator.blur.adjoint(solver.gpu, compiled, &solver.state.scratch, frame, latent, factor)
     }
 }
 
@@ -349,15 +362,15 @@ impl<'a> Solver<'a> {
         let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
         let sharp = observations.iter().any(|o| o.tsf.single().is_some());
         let shaken = settings.interpolation.unwrap_or(if sharp { Interpolation::Bilinear } else { Interpolation::Bicubic });
-        let blurs: Vec<Option<(Blur, Interpolation, bool, f32, Patch)>> = observations
+        let blurs: Vec<Option<Operator>> = observations
             .iter()
             .map(|o| {
                 (!o.tsf.is_identity()).then(|| {
                     let still = o.tsf.single().is_some();
                     let interpolation = if still { STILL } else { shaken };
                     let taps = TapSet::new(&o.tsf, frame.0, frame.1, interpolation);
-                    let compiled = kernels.blur(gpu, interpolation);
-                    (Blur::new(gpu, compiled, &taps, frame, pad), interpolation, still, taps.energy() as f32, prior::power(&taps.psf()))
+                    let blur = Blur::new(gpu, kernels.blur(gpu, interpolation), &taps, frame, pad);
+                    Operator { blur, interpolation, still, energy: taps.energy() as f32, power: prior::power(&taps.psf()) }
                 })
             })
             .collect();
@@ -372,7 +385,7 @@ impl<'a> Solver<'a> {
             )));
         }
         let scratch =
-            |size: fn(&Blur) -> ScratchSize| blurs.iter().flatten().map(|b| size(&b.0)).fold(ScratchSize::default(), ScratchSize::max);
+            |size: fn(&Blur) -> ScratchSize| blurs.iter().flatten().map(|b| size(&b.blur)).fold(ScratchSize::default(), ScratchSize::max);
         let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
         // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
         let most = (1 << 25).min(gpu.max_binding());
@@ -424,15 +437,7 @@ impl<'a> Solver<'a> {
         for (i, (o, blur)) in observations.iter().zip(blurs).enumerate() {
             let moving = match blur {
                 None => None,
-                Some((blur, interpolation, still, energy, power)) => Some(Moving {
-                    blur,
-                    interpolation,
-                    still,
-                    energy,
-                    power,
-                    weight: ch("weights", m)?,
-                    observation: ch("observations", m)?,
-                }),
+                Some(operator) => Some(Moving { operator, weight: ch("weights", m)?, observation: ch("observations", m)? }),
             };
             let misfit = misfit.clone();
             if memory.streamed {
@@ -458,20 +463,14 @@ impl<'a> Solver<'a> {
         // There is no search direction yet.
         let ones: Channels = std::array::from_fn(|_| self.state.direction[0].clone());
         self.gpu.submit(&[Step::Upload(Arc::new(vec![1.0; n]), ones[0].clone())]);
-        for (o, observed) in self.observations.iter().zip(&mut self.observed) {
-            if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(
-                    self.gpu,
-                    moving.of(self.gpu, self.kernels),
-                    &self.state.scratch,
-                    &ones,
-                    &self.state.predicted,
-                ));
+        for (i, o) in self.observations.iter().enumerate() {
+            if let Some(moving) = &self.observed[i].moving {
+                self.gpu.submit(&moving.forward(self, &ones, &self.state.predicted));
                 let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
                 let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
-                match &mut observed.host {
+                match &mut self.observed[i].host {
                     Some(host) => host[3] = Arc::new(mask),
-                    None => self.gpu.submit(&[Step::Upload(Arc::new(mask), observed.mask.clone())]),
+                    None => self.gpu.submit(&[Step::Upload(Arc::new(mask), self.observed[i].mask.clone())]),
                 }
             }
         }
@@ -515,7 +514,7 @@ impl<'a> Solver<'a> {
                     first = false;
                 }
                 Some(moving) => {
-                    steps.extend(moving.blur.forward(self.gpu, moving.of(self.gpu, self.kernels), &s.scratch, &s.irradiance, &s.predicted));
+                    steps.extend(moving.forward(self, &s.irradiance, &s.predicted));
                     steps.extend(data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch));
                     let to = WeightTarget {
                         weight: &moving.weight,
@@ -524,7 +523,7 @@ impl<'a> Solver<'a> {
                         stride: self.frame.0,
                         accumulate: false,
                     };
-                    let robust = if moving.still { STILL_ROBUST * robust } else { robust };
+                    let robust = if moving.operator.still { STILL_ROBUST * robust } else { robust };
                     steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, robust, &to));
                 }
             }
@@ -543,14 +542,14 @@ impl<'a> Solver<'a> {
             partial += partials_1d(n);
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, moving.of(self.gpu, k), &s.scratch, &s.irradiance, &s.predicted));
+            steps.extend(moving.forward(self, &s.irradiance, &s.predicted));
             for c in 0..3 {
                 let (w, o) = (&moving.weight[c], &moving.observation[c]);
                 steps.push(k.data.residual(self.gpu, &s.predicted[c], w, o, &s.frame[c], &s.partials, partial, m));
                 partial += partials_1d(m);
             }
             if project_back {
-                steps.extend(moving.blur.adjoint(self.gpu, moving.of(self.gpu, k), &s.scratch, &s.frame, &s.back, 1.0));
+                steps.extend(moving.adjoint(self, &s.frame, &s.back, 1.0));
             }
         }
         steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, partial, SLOT_DATA, false));
@@ -572,14 +571,7 @@ impl<'a> Solver<'a> {
         let n = self.latent.0 * self.latent.1;
         let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.adjoint(
-                self.gpu,
-                moving.of(self.gpu, k),
-                &s.scratch,
-                &moving.weight,
-                &s.data_diagonal,
-                moving.energy,
-            ));
+            steps.extend(moving.adjoint(self, &moving.weight, &s.data_diagonal, moving.operator.energy));
         }
         for c in 0..3 {
             steps.push(k.linear.right_side(
@@ -618,11 +610,11 @@ impl<'a> Solver<'a> {
             steps.push(k.linear.scale(self.gpu, &s.irradiance[c], &s.direction[c], &s.weight[c], &s.scaled[c], &s.back[c], n));
         }
         for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.blur.forward(self.gpu, moving.of(self.gpu, k), &s.scratch, &s.scaled, &s.predicted));
+            steps.extend(moving.forward(self, &s.scaled, &s.predicted));
             for c in 0..3 {
                 steps.push(k.linear.multiply(self.gpu, &moving.weight[c], &s.predicted[c], self.frame.0 * self.frame.1));
             }
-            steps.extend(moving.blur.adjoint(self.gpu, moving.of(self.gpu, k), &s.scratch, &s.predicted, &s.back, 1.0));
+            steps.extend(moving.adjoint(self, &s.predicted, &s.back, 1.0));
         }
         for c in 0..3 {
             let partial = c * partials_2d(self.latent);
@@ -737,7 +729,7 @@ impl<'a> Solver<'a> {
         let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
         for (i, observed) in self.observed.iter().enumerate() {
             if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.blur.forward(self.gpu, moving.of(self.gpu, self.kernels), &s.scratch, &s.irradiance, &s.predicted));
+                self.gpu.submit(&moving.forward(self, &s.irradiance, &s.predicted));
             }
             self.gpu.submit(&observed.uploads());
             let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);

@@ -80,11 +80,11 @@ impl Solver<'_> {
         self.gpu.submit(&self.weigh(self.settings.robust));
         // The interpolation has negative lobes.
         let given = |weights: &Channels| Ok::<_, Error>(self.read(weights)?.map_planes(|p| p.map(|w| w.max(0.0))));
-        let moving = |still: bool| self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(move |m| m.still == still);
+        let moving = |still: bool| self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(move |m| m.operator.still == still);
         let to = &s.data_diagonal;
         let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), to[c].clone())).collect();
         for m in moving(true) {
-            steps.extend(m.blur.adjoint(self.gpu, m.of(self.gpu, self.kernels), &s.scratch, &m.weight, to, m.energy));
+            steps.extend(m.adjoint(self, &m.weight, to, m.operator.energy));
         }
         self.gpu.submit(&steps);
         let white = given(to)?;
@@ -92,9 +92,9 @@ impl Solver<'_> {
         for m in moving(false) {
             let zero = Arc::new(vec![0f32; n]);
             let mut steps: Vec<Step> = to.iter().map(|b| Step::Upload(zero.clone(), b.clone())).collect();
-            steps.extend(m.blur.adjoint(self.gpu, m.of(self.gpu, self.kernels), &s.scratch, &m.weight, to, 1.0));
+            steps.extend(m.adjoint(self, &m.weight, to, 1.0));
             self.gpu.submit(&steps);
-            shaken.push((given(to)?, m.power));
+            shaken.push((given(to)?, m.operator.power));
         }
         Ok(Precision { white, shaken })
     }

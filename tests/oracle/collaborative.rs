@@ -83,9 +83,7 @@ fn analyse(stack: &[Vec<f64>]) -> Vec<f64> {
         .map(|p| (0..64).map(|k| (0..64).map(|i| cosines[k / 8][i / 8] * cosines[k % 8][i % 8] * p[i]).sum()).collect())
         .collect();
     for h in 0..n {
-        for k in 0..64 {
-            out.push((0..n).map(|i| haar(n, h, i) * patches[i][k]).sum());
-        }
+        out.extend((0..64).map(|k| patches.iter().enumerate().map(|(i, p)| haar(n, h, i) * p[k]).sum::<f64>()));
     }
     out
 }
