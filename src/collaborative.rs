@@ -221,8 +221,8 @@ impl Pass<'_> {
         best.into_iter().map(|b| b.1).collect()
     }
 
-    /// Shrinks the coefficients of a stack of channel `c`; returns the variance that is left in it.
-    fn shrink(&self, stack: &mut [Patch], known: &[Patch], variance: &Patch) -> f32 {
+    /// Shrinks the coefficients of a stack, by those of `known` when it is not empty; returns the variance that is left in it.
+    fn shrink(stack: &mut [Patch], known: &[Patch], variance: &Patch) -> f32 {
         let mut left = 0.0;
         for (n, patch) in stack.iter_mut().enumerate() {
             for k in 0..VALUES {
@@ -253,7 +253,7 @@ impl Pass<'_> {
                 };
                 let mut stack = transformed(&self.noisy.0[c]);
                 let known = self.basic.map_or(Vec::new(), |b| transformed(&b.0[c]));
-                let weight = 1.0 / self.shrink(&mut stack, &known, variance).max(f32::MIN_POSITIVE);
+                let weight = 1.0 / Self::shrink(&mut stack, &known, variance).max(f32::MIN_POSITIVE);
                 haar(&mut stack, &mut spare, true);
                 for (&(x, y), coefficients) in places.iter().zip(&stack) {
                     let p = transform(&self.inverse, coefficients);

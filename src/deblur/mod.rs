@@ -23,7 +23,6 @@ mod prior;
 pub use memory::Memory;
 pub use prior::Prior;
 
-use crate::collaborative::Patch;
 use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
@@ -196,7 +195,8 @@ struct Operator {
     interpolation: Interpolation,
     still: bool,
     energy: f32,
-    power: Patch,
+    /// (x, y, weight) near the frame's centre.
+    psf: Vec<(f64, f64, f64)>,
 }
 
 struct Moving {
@@ -370,7 +370,7 @@ impl<'a> Solver<'a> {
                     let interpolation = if still { STILL } else { shaken };
                     let taps = TapSet::new(&o.tsf, frame.0, frame.1, interpolation);
                     let blur = Blur::new(gpu, kernels.blur(gpu, interpolation), &taps, frame, pad);
-                    Operator { blur, interpolation, still, energy: taps.energy() as f32, power: prior::power(&taps.psf()) }
+                    Operator { blur, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
                 })
             })
             .collect();
@@ -565,14 +565,21 @@ impl<'a> Solver<'a> {
         ]
     }
 
+    /// Steps of the diagonal of Σ Kᵀ W K, roughly, over the frames in place and those that `counts` holds for.
+    fn diagonal(&self, counts: fn(&Moving) -> bool) -> Vec<Step> {
+        let s = &self.state;
+        let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
+        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(|m| counts(m)) {
+            steps.extend(moving.adjoint(self, &moving.weight, &s.data_diagonal, moving.operator.energy));
+        }
+        steps
+    }
+
     /// Right-hand side, preconditioner and the start of the conjugate gradients.
     fn start(&self) -> Vec<Step> {
         let (s, k) = (&self.state, self.kernels);
         let n = self.latent.0 * self.latent.1;
-        let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
-        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.adjoint(self, &moving.weight, &s.data_diagonal, moving.operator.energy));
-        }
+        let mut steps = self.diagonal(|_| true);
         for c in 0..3 {
             steps.push(k.linear.right_side(
                 self.gpu,

@@ -38,7 +38,7 @@ impl Prior {
 
 /// Power of a PSF (x, y, weight) around the frequencies of the patch transform, over both signs of the vertical one, which that does not
 /// tell apart.
-pub(super) fn power(psf: &[(f64, f64, f64)]) -> Patch {
+fn power(psf: &[(f64, f64, f64)]) -> Patch {
     let at = |fx: f64, fy: f64| {
         let (re, im) = psf.iter().fold((0.0, 0.0), |(re, im), (x, y, w)| {
             let (sin, cos) = (std::f64::consts::PI * (fx * x + fy * y)).sin_cos();
@@ -76,25 +76,19 @@ fn offset(weights: &Precision) -> f32 {
 impl Solver<'_> {
     /// Inverse variance of irradiance that the frames give at the present estimate.
     fn precision(&self) -> Result<Precision> {
-        let (s, n) = (&self.state, self.latent.0 * self.latent.1);
+        let s = &self.state;
         self.gpu.submit(&self.weigh(self.settings.robust));
         // The interpolation has negative lobes.
         let given = |weights: &Channels| Ok::<_, Error>(self.read(weights)?.map_planes(|p| p.map(|w| w.max(0.0))));
-        let moving = |still: bool| self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(move |m| m.operator.still == still);
         let to = &s.data_diagonal;
-        let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), to[c].clone())).collect();
-        for m in moving(true) {
-            steps.extend(m.adjoint(self, &m.weight, to, m.operator.energy));
-        }
-        self.gpu.submit(&steps);
+        self.gpu.submit(&self.diagonal(|m| m.operator.still));
         let white = given(to)?;
         let mut shaken = Vec::new();
-        for m in moving(false) {
-            let zero = Arc::new(vec![0f32; n]);
-            let mut steps: Vec<Step> = to.iter().map(|b| Step::Upload(zero.clone(), b.clone())).collect();
+        for m in self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(|m| !m.operator.still) {
+            let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
             steps.extend(m.adjoint(self, &m.weight, to, 1.0));
             self.gpu.submit(&steps);
-            shaken.push((given(to)?, m.operator.power));
+            shaken.push((given(to)?, power(&m.operator.psf)));
         }
         Ok(Precision { white, shaken })
     }

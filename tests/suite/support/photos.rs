@@ -153,7 +153,7 @@ impl Tiff {
     }
 }
 
-/// What the camera of [`dng`] sees of white: its sensor is less sensitive to red and blue.
+/// What the cameras of raw files see of white: their sensors are less sensitive to red and blue.
 pub const NEUTRAL: [f64; 3] = [0.5, 1.0, 0.625];
 pub const BLACK: f64 = 512.0;
 pub const WHITE: f64 = 15360.0;

@@ -1,6 +1,6 @@
 //! Raw files in makers' own formats, byte by byte as their cameras write them: NEF (12 bits, packed) and RAF (X-Trans, 14 bits).
 
-use super::photos::{Entry, Notes, Tiff};
+use super::photos::{Entry, NEUTRAL, Notes, Tiff};
 use unshaken::colour::{self, Matrix, Primaries};
 use unshaken::image::Rgb;
 
@@ -18,9 +18,6 @@ pub struct Sensor {
     /// Channel of the site at column x, row y.
     filter: fn(usize, usize) -> usize,
 }
-
-/// What the cameras see of white.
-pub const NEUTRAL: [f64; 3] = [0.5, 1.0, 0.625];
 
 pub const NIKON: Sensor = Sensor {
     model: "NIKON D610",
