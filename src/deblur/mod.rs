@@ -129,7 +129,7 @@ pub struct SolveReport {
     pub stop: Stop,
     /// The outer iterations.
     pub history: Vec<Iteration>,
-    /// Mean squared residual over variance of each frame, where it is not masked: 1 is what noise explains.
+    /// Mean squared residual over variance of each frame, where it is not masked, before the result is filtered: 1 is what noise explains.
     pub chi_squared: Vec<f64>,
     /// Device memory that it took.
     pub memory: Memory,
@@ -142,7 +142,7 @@ pub struct Solution {
     pub irradiance: Rgb,
     /// Pad in pixels.
     pub pad: usize,
-    /// Local χ² of each frame (Gaussian of 2 px, frame's grid).
+    /// Local χ² of each frame before the result is filtered (Gaussian of 2 px, frame's grid).
     pub misfit: Vec<Plane>,
     /// History and residuals.
     pub report: SolveReport,
@@ -725,13 +725,17 @@ impl<'a> Solver<'a> {
             }
             settled |= before - after < set.settled * before.abs();
         }
+        // How well the TSFs explain the frames is not for the prior to say.
+        let (chi_squared, misfit) = self.judge()?;
         if set.prior == Prior::Collaborative {
             self.filter(&mut |f| progress(ITERATING + (1.0 - ITERATING) * f))?;
         }
-        self.finish(history, stop)
+        let irradiance = self.read(&s.irradiance)?;
+        Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared, memory: self.memory } })
     }
 
-    fn finish(&self, history: Vec<Iteration>, stop: Stop) -> Result<Solution> {
+    /// χ² of each frame at the present estimate, as a whole and locally.
+    fn judge(&self) -> Result<(Vec<f64>, Vec<Plane>)> {
         let (s, m) = (&self.state, self.frame.0 * self.frame.1);
         let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
         for (i, observed) in self.observed.iter().enumerate() {
@@ -749,7 +753,6 @@ impl<'a> Solver<'a> {
             let local = pairs.chunks_exact(2).map(|p| if p[1] > 1e-3 { p[0] / p[1] } else { 0.0 }).collect();
             misfit.push(Plane::from_vec(self.frame.0, self.frame.1, local)?);
         }
-        let irradiance = self.read(&s.irradiance)?;
-        Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared, memory: self.memory } })
+        Ok((chi_squared, misfit))
     }
 }

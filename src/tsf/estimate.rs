@@ -248,6 +248,55 @@ const FEW: usize = 50;
 /// Continuous poses at most.
 const MOST: usize = 250;
 
+/// What [`thinned`] tries, the least sparse first: sparsity as a part of the standard deviation that the TSF leaves, and whether only what hangs
+/// together stays.
+const THINNED: [(f64, bool); 8] =
+    [(0.0, false), (0.25, false), (0.5, false), (1.0, false), (2.0, false), (0.25, true), (0.5, true), (1.0, true)];
+/// Distance in pixels up to which two poses of a camera's path hang together.
+const LINK: f64 = 3.0;
+
+/// `tsf` without the poses that only answer to noise and to what the latent irradiance lacks: the sparsest that explains those of `rows` that it
+/// was not fitted to not clearly worse than the best. Beside a chain of lamps such poses may lie far from the blur, and everything after counts
+/// on its extent.
+fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
+    let held = HeldOut::of(rows, frame.size());
+    let fitted = |evidence: &Evidence, (sparsity, connected): (f64, bool)| {
+        let left = evidence.residual(tsf).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / evidence.targets().len().max(1) as f64;
+        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * left.sqrt())?;
+        if connected { main_path(&found, chart) } else { Some(found) }
+    };
+    let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
+    let attempt = |&how: &(f64, bool)| {
+        let found = gathered(&fitted(&inside, how)?, chart)?;
+        Some((how, held.blocks(&judge.residual(&inside.refine(&found, chart, 3)))))
+    };
+    let tried: Vec<_> = THINNED.iter().filter_map(attempt).collect();
+    let best = tried.iter().min_by(|a, b| Worse::than(&a.1, &b.1).by.total_cmp(&0.0));
+    let sparsest = best.and_then(|best| tried.iter().rev().find(|t| Worse::than(&t.1, &best.1).forgivable()));
+    sparsest.and_then(|t| fitted(&Evidence::new(frame, rows), t.0)).unwrap_or_else(|| tsf.clone())
+}
+
+/// The poses of `tsf` that hang together and weigh most.
+fn main_path(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
+    let mut left: Vec<(Coordinates, &Pose)> = tsf.poses.iter().map(|p| (chart.coordinates(p), p)).collect();
+    let mut heaviest: (f64, Vec<Pose>) = (0.0, Vec::new());
+    while let Some(first) = left.pop() {
+        let mut path = vec![first];
+        let mut next = 0;
+        while next < path.len() {
+            let here = path[next].0;
+            let near = |c: &Coordinates| here.iter().zip(c).map(|(a, b)| (a - b).powi(2)).sum::<f64>() <= LINK * LINK;
+            path.extend(left.extract_if(.., |p| near(&p.0)));
+            next += 1;
+        }
+        let weight = path.iter().map(|p| p.1.weight).sum();
+        if weight > heaviest.0 {
+            heaviest = (weight, path.into_iter().map(|p| *p.1).collect());
+        }
+    }
+    Tsf::new(tsf.focal_px, heaviest.1).ok()
+}
+
 impl WholeFrame<'_> {
     /// TSF of this frame from nothing; `None` when no pose explains it better than none.
     pub fn estimate(&self, search: &Search) -> Option<Estimate> {
@@ -278,10 +327,11 @@ impl WholeFrame<'_> {
             let chart = Chart::new(planar, focal / scale, fw, fh);
             let mut here = scaled(&tsf, 1.0 / scale);
             let margin = margin(&here, (fw, fh));
+            let rows = frame.rows(ROWS / 2, margin);
             if l < count {
-                let rows = frame.rows(ROWS / 2, margin);
                 here = Evidence::new(&frame, &rows).weigh(&around(&here, &chart, 1.0), chart.focal, 1.0)?;
             }
+            here = thinned(&frame, &here, &rows, &chart);
             here = gathered(&here, &chart)?;
             let rows = frame.rows(ROWS, margin);
             here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
@@ -345,21 +395,17 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         let iterations = if search.is_stopped() { 0 } else { iterations };
         Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
     };
-    let block = w.max(h).div_ceil(BLOCKS);
-    let held = |r: &Row| (r.x as usize / block * 7 + r.y as usize / block * 13).is_multiple_of(5);
     let mut trials = Vec::new();
     let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
     if search.model == Model::Auto {
-        let (outside, inside): (Vec<Row>, Vec<Row>) = all.iter().partition(|r| held(r));
-        let judge = Evidence::new(frame, &outside);
+        let held = HeldOut::of(&all, (w, h));
+        let judge = Evidence::new(frame, &held.outside);
         // Model, focal length, and the residual of each block of held-out differences.
         type Tried = (Model, f64, Vec<(usize, f64)>);
         let mut tried: Vec<Tried> = Vec::new();
         let mut attempt = |model: Model, focal: f64| {
-            let t = fit(&inside, model, focal, &start, TRIAL);
-            let r = judge.residual(&t);
-            let blocks = outside.iter().zip(&r).map(|(o, v)| (o.y as usize / block * 1000 + o.x as usize / block, f64::from(*v).powi(2)));
-            let blocks: Vec<(usize, f64)> = blocks.collect();
+            let t = fit(&held.inside, model, focal, &start, TRIAL);
+            let blocks = held.blocks(&judge.residual(&t));
             tried.push((model, focal, blocks.clone()));
             blocks
         };
@@ -434,6 +480,27 @@ fn model_of(tsf: &Tsf) -> Model {
         (true, false) => Model::Rotation,
         (false, _) if any(|p| p.theta_z_deg) => Model::Rigid,
         (false, _) => Model::Translation,
+    }
+}
+
+/// Differences of a frame to fit to and, in every fifth block of it, to judge by.
+struct HeldOut {
+    inside: Vec<Row>,
+    outside: Vec<Row>,
+    block: usize,
+}
+
+impl HeldOut {
+    fn of(rows: &[Row], size: (usize, usize)) -> Self {
+        let block = size.0.max(size.1).div_ceil(BLOCKS);
+        let (outside, inside) = rows.iter().partition(|r| (r.x as usize / block * 7 + r.y as usize / block * 13).is_multiple_of(5));
+        Self { inside, outside, block }
+    }
+
+    /// The block and the square of each residual of the differences held out.
+    fn blocks(&self, residual: &[f32]) -> Vec<(usize, f64)> {
+        let block = |r: &Row| r.y as usize / self.block * 1000 + r.x as usize / self.block;
+        self.outside.iter().zip(residual).map(|(o, v)| (block(o), f64::from(*v).powi(2))).collect()
     }
 }
 

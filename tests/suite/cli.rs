@@ -341,7 +341,8 @@ fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
     assert_eq!(column(&report, "used"), [true; 3]);
     assert!(column(&report, "triage").iter().all(|t| t["reason"].as_str().is_some_and(|r| !r.is_empty())));
     let fit: Vec<f64> = column(&report, "chi_squared").iter().map(|v| v.as_f64().unwrap()).collect();
-    assert!(fit.iter().all(|v| (0.2..8.0).contains(v)), "chi squared per pixel {fit:?}");
+    // Judged before the result is filtered, when the cleanest frame's own noise is part of it.
+    assert!(fit.iter().all(|v| (0.1..8.0).contains(v)), "chi squared per pixel {fit:?}");
     let patches = report["frames"][2]["blur"]["patches"].as_array().unwrap();
     assert!(!patches.is_empty());
     for p in patches {

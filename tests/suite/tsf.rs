@@ -133,6 +133,35 @@ fn the_simplest_model_that_explains_the_frame_is_taken() {
 }
 
 #[test]
+fn lamps_in_a_chain_do_not_widen_the_blur() {
+    // A lamp that the noisy sharp frame shows too bright or too dark is made up for by a pose that takes a neighbour's light there.
+    let (size, pad) = ((224, 160), 24);
+    let (w, h) = (size.0 + 2 * pad, size.1 + 2 * pad);
+    let brightness = numbers(5, 64);
+    let mut scene = Plane::filled(w, h, 0.05);
+    for row in 0..3usize {
+        for i in 0..w / 14 {
+            let (x, y) = (14.0 * i as f64 + 5.0, (pad + 40 + 40 * row) as f64 + 3.0 * (0.35 * i as f64 + row as f64).sin());
+            let b = 1.0 + 0.8 * brightness[20 * row + i];
+            for (j, v) in scene.data.iter_mut().enumerate() {
+                let d = DVec2::new((j % w) as f64 - x, (j / w) as f64 - y).length_squared();
+                *v += b * (-d / 1.3).exp() as f32;
+            }
+        }
+    }
+    let truth = path(300.0, |t| Pose::planar(4.0 * t, 6.0 * (1.0 - 4.0 * t * t), 0.4 * t, 1.0));
+    let (blurred, weight) = shaken(&scene, pad, &truth, size);
+    let noise = numbers(9, w * h);
+    let latent = Plane { data: scene.data.iter().zip(&noise).map(|(v, n)| v * (1.0 + 0.5 * n) + 0.02 * n).collect(), ..scene.clone() };
+    let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
+    let found = frame.estimate(&search(Model::Rigid, Some(300.0))).expect("lamps determine it");
+    let (wide, error) = (tsf::extent(&found.tsf, size.0, size.1), operator_error(&scene, pad, &found.tsf, &truth, size));
+    let expected = tsf::extent(&truth, size.0, size.1);
+    assert!(wide < expected + 4.0, "{wide:.1} px, in truth {expected:.1}; operator error {error:.3}");
+    assert!(error < 0.08, "operator error {error:.3}");
+}
+
+#[test]
 fn blur_of_three_and_of_fifty_pixels_is_found() {
     let (size, pad) = ((224, 176), 40);
     // Structure at all scales: a long blur leaves nothing of the finest.
