@@ -7,6 +7,8 @@ seconds=$2
 shift 2
 here=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$here/corpus/$target" "$here/artifacts/$target"
-CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$here/target} RUSTC_WRAPPER=$here/coverage.sh cargo build --manifest-path "$here/Cargo.toml" --bin "$target"
-exec "${CARGO_TARGET_DIR:-$here/target}/debug/$target" -max_total_time="$seconds" -rss_limit_mb=2048 -timeout=25 -max_len=65536 \
+host=$(rustc --version --verbose | sed -n 's/^host: //p')
+CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$here/target} RUSTC_WRAPPER=$here/coverage.sh \
+    cargo build --manifest-path "$here/Cargo.toml" --target "$host" --bin "$target"
+exec "${CARGO_TARGET_DIR:-$here/target}/$host/debug/$target" -max_total_time="$seconds" -rss_limit_mb=2048 -timeout=25 -max_len=65536 \
     -artifact_prefix="$here/artifacts/$target/" "$@" "$here/corpus/$target"

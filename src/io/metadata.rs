@@ -113,6 +113,21 @@ pub fn read_bytes(bytes: &[u8]) -> Metadata {
     read_from(&mut Cursor::new(bytes))
 }
 
+/// What fields that were read by other means note.
+pub(super) fn of_fields(fields: &[Field]) -> Metadata {
+    let read = |block| exif::Reader::new().read_raw(block).ok();
+    written(fields.iter()).and_then(read).map(|exif| of(&exif)).unwrap_or_default()
+}
+
+/// Fields as EXIF data; `None` when one cannot be written (an odd type).
+fn written<'a>(fields: impl Iterator<Item = &'a Field>) -> Option<Vec<u8>> {
+    let mut writer = exif::experimental::Writer::new();
+    fields.for_each(|field| writer.push_field(field));
+    let mut block = Cursor::new(Vec::new());
+    writer.write(&mut block, false).ok()?;
+    Some(block.into_inner())
+}
+
 fn read_from(from: &mut (impl BufRead + Seek)) -> Metadata {
     exif_of(from).map(|exif| of(&exif)).unwrap_or_default()
 }
@@ -180,14 +195,35 @@ impl Metadata {
             ifd_num: In::PRIMARY,
             value: Value::Ascii(vec![concat!("unshaken ", env!("CARGO_PKG_VERSION")).into()]),
         };
-        let mut writer = exif::experimental::Writer::new();
-        for field in self.carried.iter().chain([&software]) {
-            writer.push_field(field);
+        // A field that cannot be written back costs the block, not the picture.
+        written(self.carried.iter().chain([&software]))
+    }
+
+    /// This, and what `other` notes where this notes nothing.
+    pub(super) fn or(mut self, other: Self) -> Self {
+        let lacks = |f: &Field| self.carried.iter().all(|own| own.tag != f.tag);
+        let more: Vec<Field> = other.carried.into_iter().filter(lacks).collect();
+        self.carried.extend(more);
+        Self {
+            exposure_time: self.exposure_time.or(other.exposure_time),
+            f_number: self.f_number.or(other.f_number),
+            iso: self.iso.or(other.iso),
+            exposure_bias: self.exposure_bias.or(other.exposure_bias),
+            orientation: self.orientation.or(other.orientation),
+            taken: self.taken.or(other.taken),
+            make: self.make.or(other.make),
+            model: self.model.or(other.model),
+            serial: self.serial.or(other.serial),
+            lens: self.lens.or(other.lens),
+            artist: self.artist.or(other.artist),
+            copyright: self.copyright.or(other.copyright),
+            latitude: self.latitude.or(other.latitude),
+            longitude: self.longitude.or(other.longitude),
+            altitude: self.altitude.or(other.altitude),
+            focal_mm: self.focal_mm.or(other.focal_mm),
+            noise: self.noise.or(other.noise),
+            carried: self.carried,
         }
-        let mut block = Cursor::new(Vec::new());
-        // A field that cannot be written back (an odd type) costs the block, not the picture.
-        writer.write(&mut block, false).ok()?;
-        Some(block.into_inner())
     }
 
     /// Luminance in cd/m² that saturates the frame by the camera's ISO speed: 78/S lx s on the sensor (ISO 12232, saturation based) behind a

@@ -4,6 +4,7 @@
 //! saturation included. White balance and the camera's matrix belong to the result and come along as one matrix.
 
 mod directories;
+mod notes;
 
 use super::metadata::{self, Metadata};
 use crate::colour::{self, Matrix, Primaries};
@@ -54,9 +55,8 @@ pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
         let params = RawDecodeParams::default();
         check_size(decoder.as_ref(), source.buf().len())?;
         let raw = decoder.raw_image(&source, &params, false).map_err(|e| reason(&e))?;
-        // Files that are no TIFF within (CR3, RAF) tell rawler alone.
         let mut metadata = match decoder.raw_metadata(&source, &params) {
-            Ok(m) => complete(noted, &m),
+            Ok(m) => noted.or(metadata::of_fields(&notes::fields(&m))),
             Err(_) => noted,
         };
         metadata.noise = noise_profile(decoder.as_ref());
@@ -135,30 +135,6 @@ fn quietly<T>(f: impl FnOnce() -> T) -> Option<T> {
     let out = panic::catch_unwind(AssertUnwindSafe(f)).ok();
     QUIET.set(false);
     out
-}
-
-fn complete(mut noted: Metadata, m: &rawler::decoders::RawMetadata) -> Metadata {
-    let ratio = |r: &rawler::formats::tiff::Rational| Some(f64::from(r.n) / f64::from(r.d)).filter(|v| v.is_finite());
-    let positive = |r: &rawler::formats::tiff::Rational| ratio(r).filter(|v| *v > 0.0);
-    let e = &m.exif;
-    noted.exposure_time = noted.exposure_time.or_else(|| e.exposure_time.as_ref().and_then(ratio));
-    noted.f_number = noted.f_number.or_else(|| e.fnumber.as_ref().and_then(positive));
-    noted.iso = noted.iso.or_else(|| e.iso_speed_ratings.map(f64::from).filter(|v| *v > 0.0 && *v < 65535.0));
-    noted.iso = noted.iso.or_else(|| e.iso_speed.map(f64::from).filter(|v| *v > 0.0));
-    noted.taken = noted.taken.or_else(|| e.date_time_original.clone());
-    noted.exposure_bias = noted.exposure_bias.or_else(|| {
-        let bias = e.exposure_bias.as_ref().map(|r| f64::from(r.n) / f64::from(r.d));
-        bias.filter(|v| v.abs() <= 40.0)
-    });
-    noted.orientation = noted.orientation.or_else(|| e.orientation.map(u32::from).filter(|v| (1..=8).contains(v)));
-    noted.focal_mm = noted.focal_mm.or_else(|| e.focal_length.as_ref().and_then(positive));
-    noted.artist = noted.artist.or_else(|| e.artist.clone());
-    noted.copyright = noted.copyright.or_else(|| e.copyright.clone());
-    noted.lens = noted.lens.or_else(|| e.lens_model.clone());
-    let named = |s: &str| (!s.trim().is_empty()).then(|| s.trim().to_string());
-    noted.make = noted.make.or_else(|| named(&m.make));
-    noted.model = noted.model.or_else(|| named(&m.model));
-    noted
 }
 
 fn develop(mut raw: RawImage, mut metadata: Metadata) -> Result<Raw, String> {

@@ -112,7 +112,8 @@ fn formats_of_makers_come_upright_in_true_colours() {
     for (name, write, sensor) in [("a.nef", raws::nef as Write, raws::NIKON), ("a.raf", raws::raf, raws::FUJI)] {
         let path = dir.path().join(name);
         let read = |scene: &Rgb, orientation| {
-            std::fs::write(&path, write(scene, &Notes { orientation, ..Notes::default() })).unwrap();
+            let notes = Notes { orientation, artist: Some("A. Person"), taken: Some("2024:05:06 07:08:09"), ..Notes::default() };
+            std::fs::write(&path, write(scene, &notes)).unwrap();
             input::read(&path, 1.0).unwrap()
         };
         let truth = colours(96, 72);
@@ -126,6 +127,10 @@ fn formats_of_makers_come_upright_in_true_colours() {
         assert!(off < 0.06, "{name}: Rec. 709 is off by {off:.3}");
         let m = &frame.metadata;
         assert_eq!((m.exposure_time, m.f_number, m.iso), (Some(0.125), Some(5.6), Some(200.0)), "{name}");
+        // A result inherits what the maker's format notes.
+        let block = metadata::read_bytes(&m.exif_block().unwrap());
+        assert_eq!((block.artist.as_deref(), block.taken.as_deref()), (Some("A. Person"), Some("2024:05:06 07:08:09")), "{name}");
+        assert_eq!((block.exposure_time, block.f_number, block.orientation), (Some(0.125), Some(5.6), None), "{name}");
         // The camera was turned: top left of the sensor becomes top right.
         let turned = read(&truth, 6).intensity;
         assert_eq!(turned.size(), (72, 96), "{name}");

@@ -87,6 +87,7 @@ pub fn nef(scene: &Rgb, notes: &Notes) -> Vec<u8> {
         (330, t.long(0)),
         (34665, t.long(0)),
     ];
+    main.splice(4..4, notes.artist.map(|a| (315, t.text(a))));
     let mut exif = notes.exposure(&t);
     exif.push((37500, (7, note.len() as u32, note)));
     let mut raw = vec![
@@ -124,6 +125,7 @@ pub fn raf_of(model: &str, scene: &Rgb, notes: &Notes) -> Vec<u8> {
     let (width, height, sites) = FUJI.sites(scene);
     let t = Tiff { big: false };
     let mut main = vec![(271u16, t.text("FUJIFILM")), (272, t.text(model)), (274, t.short(&[notes.orientation])), (34665, t.long(0))];
+    main.splice(3..3, notes.artist.map(|a| (315, t.text(a))));
     let mut exif = notes.exposure(&t);
     exif.push((37500, (7, 18, b"FUJIFILM\x0c\0\0\0\0\0\0\0\0\0".to_vec())));
     let exif_at = 8 + t.directory(&main, 8).len() as u32;
