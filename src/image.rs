@@ -1,6 +1,7 @@
 //! Images in memory: [`Plane`] (one `f32` channel, row-major) and [`Rgb`] (three planes of one size).
 
 use crate::error::{Error, Result};
+use rayon::prelude::*;
 
 /// One channel, `width * height` values, row-major, pixel centres at integers.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,6 +91,39 @@ impl Plane {
         let along = |x: usize, y: usize| (0..4).map(|k| f[k] * self.clamped(2 * x as isize + k as isize - 1, y as isize)).sum();
         let rows = Self::from_fn(w, self.height, along);
         Self::from_fn(w, h, |x, y| (0..4).map(|k| f[k] * rows.clamped(x as isize, 2 * y as isize + k as isize - 1)).sum())
+    }
+
+    /// Sums over squares of side 2 r + 1, clipped at the edges.
+    pub fn box_sum(&self, r: usize) -> Self {
+        let (w, h) = self.size();
+        let mut rows = self.clone();
+        rows.data.par_chunks_exact_mut(w.max(1)).zip(self.data.par_chunks_exact(w.max(1))).for_each(|(out, row)| {
+            let mut sum: f32 = row[..r.min(w)].iter().sum();
+            for x in 0..w {
+                if x + r < w {
+                    sum += row[x + r];
+                }
+                out[x] = sum;
+                if x >= r {
+                    sum -= row[x - r];
+                }
+            }
+        });
+        let mut out = rows.clone();
+        let mut sum = vec![0.0f32; w];
+        for y in 0..r.min(h) {
+            sum.iter_mut().zip(&rows.data[y * w..(y + 1) * w]).for_each(|(s, v)| *s += v);
+        }
+        for y in 0..h {
+            if y + r < h {
+                sum.iter_mut().zip(&rows.data[(y + r) * w..(y + r + 1) * w]).for_each(|(s, v)| *s += v);
+            }
+            out.data[y * w..(y + 1) * w].copy_from_slice(&sum);
+            if y >= r {
+                sum.iter_mut().zip(&rows.data[(y - r) * w..(y - r + 1) * w]).for_each(|(s, v)| *s -= v);
+            }
+        }
+        out
     }
 
     /// The plane with `pad` more pixels on every side, each a copy of the nearest edge pixel.

@@ -6,6 +6,7 @@ use crate::mask;
 use crate::noise::NoiseModel;
 use crate::pose::nearest_pixel;
 use glam::DMat3;
+use rayon::prelude::*;
 use serde::Serialize;
 
 /// What the triage found about one frame.
@@ -14,7 +15,7 @@ pub struct Verdict {
     /// Whether the frame counts as sharp.
     pub sharp: bool,
     /// Energy of one-pixel differences over that of the frame with most of it, relative to the same ratio of coarse differences, worst
-    /// direction, on pixels that both see: 1 for equally sharp frames.
+    /// direction, where both see the same light: 1 for equally sharp frames.
     pub detail: f64,
     /// Energy of one-pixel over that of two-pixel differences, worst direction: about 0.5 where edges are one pixel wide, 0.25 where
     /// they are ramps.
@@ -24,40 +25,83 @@ pub struct Verdict {
 }
 
 /// Below this share of another frame's fine structure a frame is blurred: a blur of 2 px halves the energy of one-pixel differences
-/// across its direction. Sharp frames measure 0.73 and more, shaken ones 0.02 to 0.56.
-const DETAIL: f64 = 0.6;
+/// across its direction. In place, sharp frames measure 0.74 and more, shaken ones 0.63 and less.
+const DETAIL: f64 = 0.68;
 /// Below this no edge is steep: even the best frame is blurred.
 const STEEPNESS: f64 = 0.335;
 /// Relative error of the noise level that is taken off the energies.
 const NOISE_ERROR: f64 = 0.2;
+/// Most that the noise model may be off by.
+const MOST_EXCESS: f64 = 2.0;
+/// Side in pixels of the squares of which the flattest tell the noise, as large a part of them as [`FLAT`].
+const SMALL: usize = 8;
+/// See [`SMALL`].
+const FLAT: f64 = 0.02;
+/// What that part of squares of pure noise measures, of its variance.
+const FLATTEST: f64 = 0.75;
 /// Lag in pixels of the differences that tell contrast.
 const COARSE: usize = 24;
 /// Directions in which differences are taken.
 const DIRECTIONS: [(usize, usize, bool); 4] = [(1, 0, false), (0, 1, false), (1, 1, false), (1, 1, true)];
+/// Side in pixels of the squares whose structure is compared.
+const BLOCK: usize = 16;
+/// Radius in pixels of the squares over which light is compared.
+const LOCAL: usize = 4;
+/// Relative difference up to which two frames see the same light there: blur moves light within the square, and a lamp's trail brings in
+/// light from beyond it.
+const SAME: f32 = 0.1;
+/// Common ratio of two frames' light that an exposure time or response which is not quite true explains.
+const MISTAKEN: f32 = 1.4;
 
 struct Luminance {
     value: Plane,    // irradiance
     variance: Plane, // of it
     valid: Vec<bool>,
+    /// Relative error of `variance`.
+    noise_error: f64,
 }
 
 fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
     let clipped = mask::clipped(frame);
     let dt = frame.exposure_time;
     let mean = x.mean();
+    let counts = Plane { data: clipped.iter().map(|c| if *c { 0.0 } else { 1.0 }).collect(), ..mean.clone() };
+    // What the pixels around say is free of the pixel's own noise, by which it must not be chosen or weighted.
+    let around = mean.zip(&counts, |v, k| v * k).box_sum(LOCAL).zip(&counts.box_sum(LOCAL), |s, n| if n > 0.5 { s / n } else { 0.0 });
     // Below three standard deviations, noise clipped at black is no longer symmetric.
     let floor = 3.0 * noise.read.sqrt();
-    let valid = mean.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
-    let variance = mean.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
-    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid }
+    let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
+    let variance = around.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
+    let mut found = Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR };
+    let excess = found.excess();
+    found.variance = found.variance.map(|v| v * excess as f32);
+    found.noise_error += 1.0 - 1.0 / excess;
+    found
 }
 
 impl Luminance {
+    /// Variance of the flattest squares over what the noise model says, where it is more: that of JPEG files can be far off, and what it leaves
+    /// would pass for fine structure.
+    fn excess(&self) -> f64 {
+        let columns = self.value.width.div_ceil(SMALL);
+        let mut sums = vec![[0.0f64; 3]; columns * self.value.height.div_ceil(SMALL)];
+        for_differences(self.value.size(), &self.valid, (1, 0, false), 1, |x, y, i, j| {
+            let [count, sum, noise] = &mut sums[y / SMALL * columns + x / SMALL];
+            *count += 1.0;
+            *sum += f64::from(self.value.data[i] - self.value.data[j]).powi(2);
+            *noise += f64::from(self.variance.data[i] + self.variance.data[j]);
+        });
+        let whole = sums.iter().filter(|s| s[0] > 0.5 * (SMALL * SMALL) as f64);
+        let mut ratios: Vec<f64> = whole.map(|s| s[1] / s[2]).collect();
+        let flat = (FLAT * ratios.len() as f64) as usize;
+        if ratios.is_empty() { 1.0 } else { (*ratios.select_nth_unstable_by(flat, f64::total_cmp).1 / FLATTEST).clamp(1.0, MOST_EXCESS) }
+    }
+
     /// As pixels of another frame see it, `motion` being the way from there to here: the nearest pixel, since interpolation would take
     /// fine structure away.
     fn seen(&self, motion: &DMat3) -> Self {
         let (w, h) = self.value.size();
-        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: vec![false; w * h] };
+        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: vec![false; w * h], ..*self };
         for p in 0..w * h {
             if let Some(q) = nearest_pixel(motion, w, h, p % w, p / w) {
                 out.value.data[p] = self.value.data[q];
@@ -67,30 +111,118 @@ impl Luminance {
         }
         out
     }
+
+    /// The pixels at which this frame and `other` see the same light around: structure that a lamp's trail draws over the dark beside it is
+    /// none of the scene's.
+    fn shared(&self, other: &Self) -> Vec<bool> {
+        let counts =
+            Plane { data: self.valid.iter().zip(&other.valid).map(|(a, b)| f32::from(u8::from(*a && *b))).collect(), ..self.value.clone() };
+        let sum = |plane: &Plane| plane.zip(&counts, |v, k| v * k).box_sum(LOCAL);
+        let (mine, theirs) = (sum(&self.value), sum(&other.value));
+        let noise = sum(&self.variance.zip(&other.variance, |a, b| a + b));
+        let both = |p: &usize| counts.data[*p] > 0.0 && mine.data[*p] > 0.0 && theirs.data[*p] > 0.0;
+        let mut ratios: Vec<f32> = (0..counts.data.len()).filter(both).map(|p| theirs.data[p] / mine.data[p]).collect();
+        let middle = ratios.len() / 2;
+        let ratio = if ratios.is_empty() { 1.0 } else { *ratios.select_nth_unstable_by(middle, f32::total_cmp).1 };
+        let ratio = if (1.0 / MISTAKEN..MISTAKEN).contains(&ratio) { ratio } else { 1.0 };
+        let same = |p: usize| {
+            let (a, b) = (ratio * mine.data[p], theirs.data[p]);
+            (a - b).abs() < 0.5 * SAME * (a + b) + 3.0 * noise.data[p].max(0.0).sqrt()
+        };
+        (0..counts.data.len()).map(|p| both(&p) && same(p)).collect()
+    }
 }
 
-/// Noise-free energy and its uncertainty (two standard deviations, and the noise level's own error), of differences over `lag` pixels in `direction`, of `a`, on pixels that are valid in `a` and `b`;
-/// weighted by the larger variance of the two, so that both sums of a pair speak of the same pixels in the same way.
-fn energy(a: &Luminance, b: &Luminance, direction: (usize, usize, bool), lag: usize) -> (f64, f64) {
-    let (w, h) = a.value.size();
+/// Calls `f` with the place and the indices of the two pixels of each difference over `lag` pixels in `direction` between pixels that count.
+fn for_differences(
+    (w, h): (usize, usize),
+    counts: &[bool],
+    direction: (usize, usize, bool),
+    lag: usize,
+    mut f: impl FnMut(usize, usize, usize, usize),
+) {
     let (dx, dy) = (direction.0 * lag, direction.1 * lag);
-    let (mut sum, mut scatter, mut noise) = (0.0, 0.0, 0.0);
     for y in 0..h.saturating_sub(dy) {
         for x in 0..w.saturating_sub(dx) {
             let (i, j) = if direction.2 { (y * w + x + dx, (y + dy) * w + x) } else { (y * w + x, (y + dy) * w + x + dx) };
-            if !(a.valid[i] && a.valid[j] && b.valid[i] && b.valid[j]) {
-                continue;
+            if counts[i] && counts[j] {
+                f(x, y, i, j);
             }
-            let own = f64::from(a.variance.data[i] + a.variance.data[j]);
-            let weight = 1.0 / own.max(f64::from(b.variance.data[i] + b.variance.data[j]));
-            let d = f64::from(a.value.data[i] - a.value.data[j]);
-            sum += weight * (d * d - own);
-            noise += weight * own;
-            // Variance of a squared difference of noise sigma^2: 2 sigma^4 + 4 d^2 sigma^2.
-            scatter += weight * weight * (2.0 * own * own + 4.0 * (d * d - own).max(0.0) * own);
         }
     }
-    (sum, 2.0 * scatter.sqrt() + NOISE_ERROR * noise)
+}
+
+/// Differences of a frame over some pixels in one direction.
+struct Energy {
+    /// Noise-free, weighted.
+    sum: f64,
+    /// Two standard deviations, and the noise level's own error.
+    error: f64,
+    /// Parts of `sum` by squares of [`BLOCK`] pixels.
+    blocks: Vec<f64>,
+}
+
+/// [`Energy`] of differences over `lag` pixels in `direction` of `a`, between pixels that are `shared` with `b`; weighted by the larger variance
+/// of the two, so that both sums of a pair speak of the same pixels in the same way.
+fn energy(a: &Luminance, b: &Luminance, shared: &[bool], direction: (usize, usize, bool), lag: usize) -> Energy {
+    let columns = a.value.width.div_ceil(BLOCK);
+    let mut blocks = vec![0.0; columns * a.value.height.div_ceil(BLOCK)];
+    let (mut scatter, mut noise) = (0.0, 0.0);
+    for_differences(a.value.size(), shared, direction, lag, |x, y, i, j| {
+        let own = f64::from(a.variance.data[i] + a.variance.data[j]);
+        let weight = 1.0 / own.max(f64::from(b.variance.data[i] + b.variance.data[j]));
+        let d = f64::from(a.value.data[i] - a.value.data[j]);
+        blocks[y / BLOCK * columns + x / BLOCK] += weight * (d * d - own);
+        noise += weight * own;
+        // Variance of a squared difference of noise sigma^2: 2 sigma^4 + 4 d^2 sigma^2.
+        scatter += weight * weight * (2.0 * own * own + 4.0 * (d * d - own).max(0.0) * own);
+    });
+    Energy { sum: blocks.iter().sum(), error: 2.0 * scatter.sqrt() + a.noise_error * noise, blocks }
+}
+
+/// Fine structure of a frame as a part of another's, at most that: with the errors of both, and two standard errors of what the squares of the
+/// frame say, each by itself, since what a few of them say may be a trail's. `None` where the other's does not stand clear of noise.
+fn share(own: &Energy, other: &Energy) -> Option<f64> {
+    if other.sum <= 3.0 * other.error || other.sum <= 3.0 * own.error {
+        return None;
+    }
+    let share = (own.sum + own.error).max(0.0) / other.sum;
+    let scatter: f64 = own.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - share * b).powi(2)).sum();
+    Some(share + 2.0 * scatter.sqrt() / other.sum)
+}
+
+/// [`Verdict::detail`] of two frames against each other, `motion` being the way from the first's pixels to the second's.
+fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [f64; 2] {
+    // Each of the two on its own pixels, of which those count that the other sees as well.
+    let apart = *motion != DMat3::IDENTITY;
+    let (b_seen, a_seen) = (apart.then(|| b.seen(motion)), apart.then(|| a.seen(&motion.inverse())));
+    let (b_seen, a_seen) = (b_seen.as_ref().unwrap_or(b), a_seen.as_ref().unwrap_or(a));
+    let on_a = a.shared(b_seen);
+    let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
+    let mut detail = [1.0f64; 2];
+    for direction in DIRECTIONS {
+        let of = |lag| [energy(a, b_seen, &on_a, direction, lag), energy(b, a_seen, &on_b, direction, lag)];
+        let (fine, coarse) = (of(1), of(COARSE));
+        for (i, j) in [(0, 1), (1, 0)] {
+            // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
+            let known = coarse[0].sum > 0.0 && coarse[1].sum > 0.0;
+            let contrast = if known { (coarse[i].sum / coarse[j].sum).min(1.0) } else { 1.0 };
+            if let Some(share) = share(&fine[i], &fine[j]) {
+                detail[i] = detail[i].min(share / contrast);
+            }
+        }
+    }
+    detail
+}
+
+/// [`Verdict::steepness`].
+fn steepness(a: &Luminance) -> f64 {
+    let steep = DIRECTIONS.iter().filter_map(|&d| {
+        let (one, two) = (energy(a, a, &a.valid, d, 1), energy(a, a, &a.valid, d, 2));
+        (two.sum > 3.0 * two.error).then(|| one.sum.max(0.0) / two.sum)
+    });
+    let least = steep.fold(f64::INFINITY, f64::min);
+    if least.is_finite() { least } else { 0.5 }
 }
 
 /// Sorts the frames. `given` (from the user) overrides; the numbers are reported all the same. `motions`: each frame's place, from the
@@ -103,37 +235,20 @@ pub fn triage(
     given: Option<&[usize]>,
     motions: &[DMat3],
 ) -> Vec<Verdict> {
-    let all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
-    let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
-    let mut verdicts: Vec<Verdict> = (0..frames.len())
-        .map(|i| {
-            let mut detail = 1.0f64;
-            for &j in used.iter().filter(|&&j| j != i) {
-                // Each of the two on its own pixels, of which those count that the other sees as well.
-                let apart = motions[i] != motions[j];
-                let from_i = apart.then(|| all[j].seen(&(motions[j] * motions[i].inverse())));
-                let from_j = apart.then(|| all[i].seen(&(motions[i] * motions[j].inverse())));
-                let (a, b) = (from_i.as_ref().unwrap_or(&all[j]), from_j.as_ref().unwrap_or(&all[i]));
-                for direction in DIRECTIONS {
-                    let ((own, own_error), (other, error)) = (energy(&all[i], a, direction, 1), energy(&all[j], b, direction, 1));
-                    let (coarse, coarse_other) = (energy(&all[i], a, direction, COARSE).0, energy(&all[j], b, direction, COARSE).0);
-                    // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
-                    let contrast = if coarse > 0.0 && coarse_other > 0.0 { (coarse / coarse_other).min(1.0) } else { 1.0 };
-                    // Only where the other frame's fine structure stands clear of its noise, and of this frame's.
-                    if other > 3.0 * error && other > 3.0 * own_error {
-                        detail = detail.min((own + own_error).max(0.0) / (other * contrast));
-                    }
-                }
+    let all: Vec<Luminance> = frames.par_iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
+    let verdict = |a| Verdict { sharp: false, detail: 1.0, steepness: steepness(a), reason: String::new() };
+    let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
+    // A frame that is left out is measured against the others, not they against it.
+    let pairs: Vec<(usize, usize)> =
+        (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
+    let found: Vec<[f64; 2]> = pairs.par_iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
+    for (&(i, j), detail) in pairs.iter().zip(&found) {
+        for (k, own, other) in [(0, i, j), (1, j, i)] {
+            if !excluded[other] {
+                verdicts[own].detail = verdicts[own].detail.min(detail[k]);
             }
-            let steep = DIRECTIONS.iter().filter_map(|&d| {
-                let ((one, _), (two, error)) = (energy(&all[i], &all[i], d, 1), energy(&all[i], &all[i], d, 2));
-                (two > 3.0 * error).then(|| one.max(0.0) / two)
-            });
-            let steepness = steep.fold(f64::INFINITY, f64::min);
-            let steepness = if steepness.is_finite() { steepness } else { 0.5 };
-            Verdict { sharp: false, detail, steepness, reason: String::new() }
-        })
-        .collect();
+        }
+    }
     for (i, v) in verdicts.iter_mut().enumerate() {
         if let Some(list) = given {
             v.sharp = list.contains(&i);

@@ -47,6 +47,10 @@ pub fn is_raw_name(ending: &str) -> bool {
 /// # Errors
 /// Why it cannot be, with the remedy, in words that follow the file's name.
 pub fn read(bytes: Vec<u8>) -> Result<Raw, String> {
+    // rawler looks for pixels in JPEG files, and in a truncated one for ever.
+    if bytes.starts_with(b"\xff\xd8") {
+        return Err("is a JPEG file, whatever its name says; rename it".into());
+    }
     directories::check(&bytes)?;
     let noted = metadata::read_bytes(&bytes);
     quietly(move || {

@@ -1,6 +1,6 @@
 //! Alignment without features: correlation of two small pictures over all shifts and a few rolls, on the pixels that both see.
 
-use super::picture::{Tone, box_sum};
+use super::picture::Tone;
 use crate::fft::{Fft2, Spectrum};
 use crate::image::Plane;
 use glam::{DMat3, DVec2};
@@ -18,7 +18,7 @@ fn detail(tone: &Tone) -> (Plane, Plane) {
     let c2 = CONTRAST * CONTRAST;
     let weight =
         Plane { data: tone.valid.data.iter().zip(&tone.variance.data).map(|(m, v)| m * c2 / (c2 + v)).collect(), ..tone.value.clone() };
-    let (sum, total) = (box_sum(&tone.value.zip(&weight, |v, k| v * k), LOCAL), box_sum(&weight, LOCAL));
+    let (sum, total) = (tone.value.zip(&weight, |v, k| v * k).box_sum(LOCAL), weight.box_sum(LOCAL));
     let value = Plane {
         data: (0..weight.data.len())
             .map(|i| if weight.data[i] > 1e-3 { tone.value.data[i] - sum.data[i] / total.data[i].max(1e-6) } else { 0.0 })

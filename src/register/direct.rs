@@ -2,7 +2,7 @@
 //! anything that changes slowly over the frame (a wrong exposure time or response, vignetting).
 
 use super::motion::{Model, fields, normalised};
-use super::picture::{Tone, box_sum};
+use super::picture::Tone;
 use crate::image::Plane;
 use glam::{DMat3, DVec2};
 use nalgebra::{DMatrix, DVector};
@@ -55,7 +55,7 @@ fn difference(reference: &Tone, frame: &Tone, motion: &DMat3) -> Difference {
             residual.data[i] = weight.data[i] * (reference.value.data[i] - seen.value.data[i]);
         }
     }
-    let (sums, totals) = (box_sum(&residual, LOCAL), box_sum(&weight, LOCAL));
+    let (sums, totals) = (residual.box_sum(LOCAL), weight.box_sum(LOCAL));
     for i in 0..n {
         if weight.data[i] > 0.0 {
             residual.data[i] = residual.data[i] / weight.data[i] - sums.data[i] / totals.data[i].max(f32::MIN_POSITIVE);
@@ -319,9 +319,9 @@ fn correlations(reference: &Tone, seen: &Tone) -> Vec<f64> {
             .collect(),
         ..reference.value.clone()
     };
-    let total = box_sum(&weight, LOCAL);
+    let total = weight.box_sum(LOCAL);
     let detail = |p: &Plane| {
-        let sum = box_sum(&p.zip(&weight, |v, k| v * k), LOCAL);
+        let sum = p.zip(&weight, |v, k| v * k).box_sum(LOCAL);
         Plane {
             data: (0..n).map(|i| if weight.data[i] > 0.0 { p.data[i] - sum.data[i] / total.data[i].max(1e-20) } else { 0.0 }).collect(),
             ..p.clone()

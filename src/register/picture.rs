@@ -177,7 +177,7 @@ impl Tone {
     /// This picture, means over squares of side 2 r + 1.
     pub(super) fn softened(&self, r: usize) -> Self {
         let ones = self.value.map(|_| 1.0);
-        let value = box_sum(&self.value, r).zip(&box_sum(&ones, r), |s, n| s / n);
+        let value = self.value.box_sum(r).zip(&ones.box_sum(r), |s, n| s / n);
         Self { value, ..self.clone() }
     }
 
@@ -241,37 +241,4 @@ fn bicubic(p: &Plane, q: DVec2) -> f32 {
         }
     }
     sum
-}
-
-/// Sums over squares of side 2 r + 1, clipped at the edges.
-pub(super) fn box_sum(plane: &Plane, r: usize) -> Plane {
-    let (w, h) = plane.size();
-    let mut rows = plane.clone();
-    rows.data.par_chunks_exact_mut(w).zip(plane.data.par_chunks_exact(w)).for_each(|(out, row)| {
-        let mut sum: f32 = row[..r.min(w)].iter().sum();
-        for x in 0..w {
-            if x + r < w {
-                sum += row[x + r];
-            }
-            out[x] = sum;
-            if x >= r {
-                sum -= row[x - r];
-            }
-        }
-    });
-    let mut out = rows.clone();
-    let mut sum = vec![0.0f32; w];
-    for y in 0..r.min(h) {
-        sum.iter_mut().zip(&rows.data[y * w..(y + 1) * w]).for_each(|(s, v)| *s += v);
-    }
-    for y in 0..h {
-        if y + r < h {
-            sum.iter_mut().zip(&rows.data[(y + r) * w..(y + r + 1) * w]).for_each(|(s, v)| *s += v);
-        }
-        out.data[y * w..(y + 1) * w].copy_from_slice(&sum);
-        if y >= r {
-            sum.iter_mut().zip(&rows.data[(y - r) * w..(y - r + 1) * w]).for_each(|(s, v)| *s -= v);
-        }
-    }
-    out
 }

@@ -166,6 +166,9 @@ fn raw_files_that_cannot_be_developed_are_refused() {
         assert!(text.contains("a.dng") && (text.contains("copy it again") || text.contains("DNG")) && text.lines().count() == 1, "{text}");
     }
     assert!(error(b"nothing").contains("of a kind that is not supported (No decoder found)"), "{}", error(b"nothing"));
+    // Five bytes on which the decoder does not return.
+    let text = error(b"\xff\xd8\xff\xe1\xd6");
+    assert!(text.contains("a.dng") && text.contains("JPEG") && text.contains("rename it"), "{text}");
     let diagonal = dir.path().join("a.raf");
     std::fs::write(&diagonal, raws::raf_of("FinePix S5600", &colours(96, 72), &Notes::default())).unwrap();
     let text = input::read(&diagonal, 1.0).map(|i| i.intensity.size()).unwrap_err().to_string();

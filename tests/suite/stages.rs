@@ -10,7 +10,7 @@ use unshaken::noise;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch, Psf};
 use unshaken::response::Response;
-use unshaken::synth::{self, Camera, Tremor};
+use unshaken::synth::{self, Camera, Drawn, Tremor};
 use unshaken::triage;
 use unshaken::tsf::{self, Tsf};
 
@@ -177,6 +177,22 @@ fn the_tsf_of_exact_psfs_is_the_planted_one() {
             .map(|p| p.weight)
             .sum();
         assert!((weight - want.weight).abs() < 0.08, "{want:?} has weight {weight:.3}");
+    }
+}
+
+/// Burnt-out lamps draw trails over the dark beside them: structure that the sharp frames lack.
+#[test]
+fn trails_of_lamps_are_not_taken_for_fine_structure() {
+    let tremor = Tremor { extent_px: 6.0, roll_deg: 2.4, offset_px: 1.0, offset_deg: 0.1 };
+    let times = [1.0 / 30.0, 0.125, 0.2, 0.5, 2.0];
+    for scene in [Drawn::Lamps, Drawn::Window, Drawn::Foliage] {
+        let frames: Vec<_> = times.iter().map(|&t| (t, (t > 0.25).then(|| tremor.clone()))).collect();
+        let made = synth::capture(&scene.draw(192, 144, 40, 2, 1), &Camera::default(), &frames, 0.05, 1).unwrap();
+        let frames = made.bracket.frames();
+        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
+        let level = noise::estimate(frames, &exposures, &Response::Srgb);
+        let found = triage::triage(frames, &exposures, &level, &[false; 5], None, &[DMat3::IDENTITY; 5]);
+        assert_eq!(found.iter().map(|v| v.sharp).collect::<Vec<_>>(), made.sharp, "{}: {found:?}", scene.name());
     }
 }
 
