@@ -565,7 +565,8 @@ impl Run<'_> {
         let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
-            let (tsf, detail) = self.blur(i, &latent)?;
+            let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
+            let (tsf, detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, &latent)))?;
             if tsf.is_none() {
                 self.leave_out(
                     i,
@@ -636,6 +637,15 @@ impl Run<'_> {
             }
         };
         self.progress("finishing", 0.99)?;
+        // For people to look at: patches and their PSFs, eq. (11), against the sharp frames.
+        for &i in &shaken {
+            if details[i].is_null() {
+                continue;
+            }
+            let own = format!("{i} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
+            let tsf = tsfs[i].as_ref().expect("frames without were left out");
+            details[i]["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, &start, tsf)))?;
+        }
         self.finish(solution, reference, &verdicts, &sharp, &all, &tsfs, details)
     }
 
@@ -807,17 +817,6 @@ impl Run<'_> {
             ..exposure
         };
         (exposure.map(|v| v / dt), weight)
-    }
-
-    /// TSF of frame `i` against the sharp irradiance, and, for people to look at, patches and their PSFs (11).
-    fn blur(&mut self, i: usize, latent: &Rgb) -> Result<(Option<Tsf>, Value)> {
-        let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
-        let (tsf, mut detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, latent)))?;
-        if let Some(tsf) = &tsf {
-            let own = format!("{own} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
-            detail["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, latent, tsf)))?;
-        }
-        Ok((tsf, detail))
     }
 
     /// TSF of frame `i` against the sharp irradiance, about where the frame lies, and what is known of it.

@@ -121,9 +121,9 @@ pub(super) struct MergeArgs {
     /// Full well and read noise in electrons, such as 12000,6 [default: what DNG files note, else estimated from the frames]
     #[arg(long, value_name = "FULL_WELL,READ_NOISE", allow_hyphen_values = true)]
     pub noise: Option<String>,
-    /// Interpolation of the blurred frames' warps [default: bilinear, without a sharp frame bicubic]
-    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"])]
-    pub interpolation: Option<String>,
+    /// Interpolation of the blurred frames' warps
+    #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bicubic")]
+    pub interpolation: String,
     /// When no frame is sharp: auto (all blurs and the scene together; also when frames only pass for sharp and all turn out to have moved), joint (so whatever passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: auto]
     #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,

@@ -340,6 +340,7 @@ impl PhotoSettings {
             ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
             ("--prior".into(), args.prior.clone()),
+            ("--interpolation".into(), args.interpolation.clone()),
             ("--lambda".into(), or(&args.lambda, "2.5")),
             ("--robust".into(), or(&args.robust, "1")),
         ]
@@ -438,11 +439,11 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     }
     settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
     settings.deblur.prior = if args.prior == "tv" { Prior::Tv } else { Prior::Collaborative };
-    settings.deblur.interpolation = args.interpolation.as_deref().map(|word| match word {
-        "bicubic" => Interpolation::Bicubic,
+    settings.deblur.interpolation = match args.interpolation.as_str() {
+        "bilinear" => Interpolation::Bilinear,
         "six-point" => Interpolation::SixPoint,
-        _ => Interpolation::Bilinear,
-    });
+        _ => Interpolation::Bicubic,
+    };
     settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
     settings.blind = blind(args.blind.as_deref())?;
     if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {

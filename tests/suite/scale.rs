@@ -43,7 +43,7 @@ fn bracket() -> Vec<Observation> {
 
 fn run(gpu: &Gpu, kernels: &Kernels, memory_limit: Option<u64>) -> Result<Solution, Error> {
     let start = Rgb::filled(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD, 0.3);
-    let settings = Settings { outer: 2, inner: 5, memory_limit, interpolation: Some(Interpolation::Bilinear), ..Settings::default() };
+    let settings = Settings { outer: 2, inner: 5, memory_limit, interpolation: Interpolation::Bilinear, ..Settings::default() };
     solve(gpu, kernels, &bracket(), &start, PAD, &settings, &mut |_| true)
 }
 

@@ -86,14 +86,7 @@ fn start(pad: usize) -> Rgb {
 }
 
 fn settings() -> Settings {
-    Settings {
-        lambda: 2.0,
-        epsilon: 0.05,
-        settled: f64::INFINITY,
-        interpolation: Some(INTERPOLATION),
-        prior: Prior::Tv,
-        ..Settings::default()
-    }
+    Settings { lambda: 2.0, epsilon: 0.05, settled: f64::INFINITY, interpolation: INTERPOLATION, prior: Prior::Tv, ..Settings::default() }
 }
 
 fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Settings) -> Solution {
