@@ -199,20 +199,15 @@ fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [f64; 2] {
     let (b_seen, a_seen) = (b_seen.as_ref().unwrap_or(b), a_seen.as_ref().unwrap_or(a));
     let on_a = a.shared(b_seen);
     let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
-    let mut detail = [1.0f64; 2];
-    for direction in DIRECTIONS {
+    let along = |&direction: &(usize, usize, bool)| {
         let of = |lag| [energy(a, b_seen, &on_a, direction, lag), energy(b, a_seen, &on_b, direction, lag)];
         let (fine, coarse) = (of(1), of(COARSE));
-        for (i, j) in [(0, 1), (1, 0)] {
-            // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
-            let known = coarse[0].sum > 0.0 && coarse[1].sum > 0.0;
-            let contrast = if known { (coarse[i].sum / coarse[j].sum).min(1.0) } else { 1.0 };
-            if let Some(share) = share(&fine[i], &fine[j]) {
-                detail[i] = detail[i].min(share / contrast);
-            }
-        }
-    }
-    detail
+        // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
+        let known = coarse[0].sum > 0.0 && coarse[1].sum > 0.0;
+        let contrast = |i: usize, j: usize| if known { (coarse[i].sum / coarse[j].sum).min(1.0) } else { 1.0 };
+        [(0, 1), (1, 0)].map(|(i, j)| share(&fine[i], &fine[j]).map_or(1.0, |share| share / contrast(i, j)))
+    };
+    DIRECTIONS.par_iter().map(along).reduce(|| [1.0; 2], |x, y| [x[0].min(y[0]), x[1].min(y[1])])
 }
 
 /// [`Verdict::steepness`].
@@ -235,13 +230,13 @@ pub fn triage(
     given: Option<&[usize]>,
     motions: &[DMat3],
 ) -> Vec<Verdict> {
-    let all: Vec<Luminance> = frames.par_iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
+    let all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
     let verdict = |a| Verdict { sharp: false, detail: 1.0, steepness: steepness(a), reason: String::new() };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
-    // A frame that is left out is measured against the others, not they against it.
+    // A frame that is left out is measured against the others, not they against it. One pair after the other: each takes several planes.
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
-    let found: Vec<[f64; 2]> = pairs.par_iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
+    let found: Vec<[f64; 2]> = pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
         for (k, own, other) in [(0, i, j), (1, j, i)] {
             if !excluded[other] {
