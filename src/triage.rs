@@ -72,11 +72,7 @@ fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
     let floor = 3.0 * noise.read.sqrt();
     let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
     let variance = around.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
-    let mut found = Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR };
-    let excess = found.excess();
-    found.variance = found.variance.map(|v| v * excess as f32);
-    found.noise_error += 1.0 - 1.0 / excess;
-    found
+    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR }
 }
 
 impl Luminance {
@@ -95,6 +91,13 @@ impl Luminance {
         let mut ratios: Vec<f64> = whole.map(|s| s[1] / s[2]).collect();
         let flat = (FLAT * ratios.len() as f64) as usize;
         if ratios.is_empty() { 1.0 } else { (*ratios.select_nth_unstable_by(flat, f64::total_cmp).1 / FLATTEST).clamp(1.0, MOST_EXCESS) }
+    }
+
+    /// Variance as the frame itself shows it, where that is more than what the noise model says.
+    fn correct(&mut self) {
+        let excess = self.excess();
+        self.variance = self.variance.map(|v| v * excess as f32);
+        self.noise_error += 1.0 - 1.0 / excess;
     }
 
     /// As pixels of another frame see it, `motion` being the way from there to here: the nearest pixel, since interpolation would take
@@ -230,9 +233,11 @@ pub fn triage(
     given: Option<&[usize]>,
     motions: &[DMat3],
 ) -> Vec<Verdict> {
-    let all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
+    let mut all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
     let verdict = |a| Verdict { sharp: false, detail: 1.0, steepness: steepness(a), reason: String::new() };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
+    // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
+    all.iter_mut().for_each(Luminance::correct);
     // A frame that is left out is measured against the others, not they against it. One pair after the other: each takes several planes.
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
