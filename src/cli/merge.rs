@@ -22,12 +22,9 @@ use std::sync::Arc;
 
 pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     // Everything that can be refused without reading pixels comes first: a merge takes a while.
-    let mut targets = None;
-    let job = Job::of(args, &mut |response_file| {
-        targets = Some(outputs(args, response_file)?);
-        Ok(())
-    })?;
-    let targets = targets.expect("set before the job is understood");
+    let asked = Asked::of(args)?;
+    let targets = asked.outputs()?;
+    let job = asked.read()?;
     let (text, quality) = with_progress(|events| {
         let mut opened = job.open(events)?;
         let settings = job.settings(&opened)?.reduced(job.divisor);
@@ -82,9 +79,22 @@ pub(super) struct Opened {
     notes: Vec<String>,
 }
 
-impl<'a> Job<'a> {
-    /// `check` looks at the outputs, given the response file, before any file is read.
-    pub fn of(args: &'a MergeArgs, check: &mut dyn FnMut(Option<&Path>) -> anyhow::Result<()>) -> anyhow::Result<Self> {
+/// What the arguments say by themselves.
+pub(super) struct Asked<'a> {
+    args: &'a MergeArgs,
+    times: Option<Vec<f64>>,
+    values: Option<Vec<f64>>,
+    settings: Settings,
+    divisor: usize,
+    /// A response that has a name.
+    named: Option<Response>,
+    /// One that stands in a file.
+    response_file: Option<PathBuf>,
+}
+
+impl<'a> Asked<'a> {
+    /// Refuses what can be refused without reading a file.
+    pub fn of(args: &'a MergeArgs) -> anyhow::Result<Self> {
         let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
         let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
         let settings = settings(args)?;
@@ -93,7 +103,37 @@ impl<'a> Job<'a> {
         let word = args.response.as_deref().filter(|r| *r != "auto");
         let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
         let response_file = word.filter(|_| named.is_none()).map(PathBuf::from);
-        check(response_file.as_deref())?;
+        Ok(Self { args, times, values, settings, divisor, named, response_file })
+    }
+
+    /// The outputs, none of which may be an input.
+    pub fn outputs(&self) -> anyhow::Result<Targets> {
+        let args = self.args;
+        let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
+        inputs.extend(self.response_file.as_deref().map(|p| ("response file", p)));
+        inputs.extend(args.tsf.as_deref().map(|p| ("TSF file", p)));
+        inputs.extend(args.photo.config.as_deref().map(|p| ("configuration", p)));
+        let mut targets = vec![("--output", args.output.as_path())];
+        targets.extend(args.preview.as_deref().map(|p| ("--preview", p)));
+        targets.extend(args.report.as_deref().map(|p| ("--report", p)));
+        targets.extend(args.photo.report_html.as_deref().map(|p| ("--report-html", p)));
+        output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
+        let check = |p: &PathBuf| Output::check(p, args.overwrite);
+        let checked = |p: &Option<PathBuf>| p.as_ref().map(check).transpose();
+        let targets = Targets {
+            linear: check(&args.output)?,
+            preview: checked(&args.preview)?,
+            report: checked(&args.report)?,
+            page: checked(&args.photo.report_html)?,
+        };
+        // A folder or an input first: its name says nothing of a format.
+        check_format(args)?;
+        Ok(targets)
+    }
+
+    /// Reads the files that say how, not yet the frames.
+    pub fn read(self) -> anyhow::Result<Job<'a>> {
+        let Self { args, times, values, settings, divisor, named, response_file } = self;
         let photo = PhotoSettings::of(args)?;
         let response = match (named, &response_file) {
             (None, Some(path)) => Some(read_response(path)?),
@@ -103,9 +143,11 @@ impl<'a> Job<'a> {
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsf_names(file, path, &args.frames)?;
         }
-        Ok(Self { args, times, values, settings, divisor, response, tsf, photo })
+        Ok(Job { args, times, values, settings, divisor, response, tsf, photo })
     }
+}
 
+impl Job<'_> {
     /// Reads the frames and finds their response.
     pub fn open(&self, events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened> {
         let args = self.args;
@@ -548,29 +590,6 @@ fn check_format(args: &MergeArgs) -> Result<(), Usage> {
         return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
     }
     Ok(())
-}
-
-pub(super) fn outputs(args: &MergeArgs, response_file: Option<&Path>) -> anyhow::Result<Targets> {
-    let mut inputs: Vec<_> = args.frames.iter().map(|p| ("frame", p.as_path())).collect();
-    inputs.extend(response_file.map(|p| ("response file", p)));
-    inputs.extend(args.tsf.as_deref().map(|p| ("TSF file", p)));
-    inputs.extend(args.photo.config.as_deref().map(|p| ("configuration", p)));
-    let mut targets = vec![("--output", args.output.as_path())];
-    targets.extend(args.preview.as_deref().map(|p| ("--preview", p)));
-    targets.extend(args.report.as_deref().map(|p| ("--report", p)));
-    targets.extend(args.photo.report_html.as_deref().map(|p| ("--report-html", p)));
-    output::check_distinct(&targets, &inputs).map_err(|e| Usage(e.to_string()))?;
-    let check = |p: &PathBuf| Output::check(p, args.overwrite);
-    let checked = |p: &Option<PathBuf>| p.as_ref().map(check).transpose();
-    let targets = Targets {
-        linear: check(&args.output)?,
-        preview: checked(&args.preview)?,
-        report: checked(&args.report)?,
-        page: checked(&args.photo.report_html)?,
-    };
-    // A folder or an input first: its name says nothing of a format.
-    check_format(args)?;
-    Ok(targets)
 }
 
 pub(super) fn read_response(path: &Path) -> Result<Response, Error> {

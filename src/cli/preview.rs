@@ -1,7 +1,7 @@
 //! `unshaken preview`: the window, and `merge` behind it.
 
 use super::args::{Command, MergeArgs};
-use super::merge::{self, Job};
+use super::merge::{self, Asked};
 use super::options::{self, Parsed, Refused};
 use crate::colour::{self, Primaries};
 use crate::exposure::Bracket;
@@ -86,7 +86,7 @@ fn own(opened: &Opened) -> anyhow::Result<&merge::Opened> {
 impl Program for Merge {
     fn open(&self, arguments: &[OsString], events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened> {
         let args = understood(arguments)?;
-        let opened = Job::of(&args, &mut |_| Ok(()))?.open(events)?;
+        let opened = Asked::of(&args)?.read()?.open(events)?;
         let back = colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries");
         Ok(Opened {
             bracket: opened.bracket.clone(),
@@ -98,7 +98,7 @@ impl Program for Merge {
 
     fn settings(&self, arguments: &[OsString], opened: &Opened) -> anyhow::Result<Settings> {
         let args = understood(arguments)?;
-        Job::of(&args, &mut |_| Ok(()))?.settings(own(opened)?)
+        Asked::of(&args)?.read()?.settings(own(opened)?)
     }
 
     fn write(
@@ -110,12 +110,9 @@ impl Program for Merge {
         warnings: &[String],
     ) -> anyhow::Result<String> {
         let args = understood(arguments)?;
-        let mut targets = None;
-        let job = Job::of(&args, &mut |response_file| {
-            targets = Some(merge::outputs(&args, response_file)?);
-            Ok(())
-        })?;
-        let targets = targets.expect("set before the job is understood");
+        let asked = Asked::of(&args)?;
+        let targets = asked.outputs()?;
+        let job = asked.read()?;
         let mut said = Vec::new();
         let text = job.write(&targets, own(opened)?, bracket, outcome, warnings, &mut |event| {
             if let Event::Warning(text) = event {

@@ -1,14 +1,16 @@
 //! Device, buffers, dispatch. Knows no image, pose or solver.
 
+mod gate;
 mod kernel;
 mod readback;
 
+pub use gate::Gate;
 pub use kernel::{Kernel, Step, grid_1d};
 pub use readback::read;
 
 use crate::error::{Error, Result};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// What to install when no adapter is found, per system.
@@ -46,6 +48,8 @@ pub struct Gpu {
 
 /// Small submissions, of which two are under way.
 struct Turns {
+    /// What they pass.
+    gate: Arc<Gate>,
     /// Steps of the next.
     steps: AtomicUsize,
     /// The last, when it was made, and its steps.
@@ -159,9 +163,10 @@ impl Gpu {
     }
 
     /// A device that others draw on as well. Work is submitted in small turns, two at a time, so that what they draw
-    /// comes in between; results are those of [`Gpu::new`].
-    pub fn shared(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Self {
-        Self { turns: Some(Turns { steps: AtomicUsize::new(FEWEST), last: Mutex::new(None) }), ..Self::on(adapter, device, queue) }
+    /// comes in between, and only while `gate` is open; results are those of [`Gpu::new`].
+    pub fn shared(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue, gate: Arc<Gate>) -> Self {
+        let turns = Turns { gate, steps: AtomicUsize::new(FEWEST), last: Mutex::new(None) };
+        Self { turns: Some(turns), ..Self::on(adapter, device, queue) }
     }
 
     /// The same with `bytes` of memory for planes at most, as on an adapter that has no more.
@@ -288,12 +293,17 @@ impl Gpu {
                         self.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
                     }
                 }
-                let index = self.queue.submit([encoder.finish()]);
+                let index = self.pass(encoder.finish());
                 if let Some(turns) = &self.turns {
                     self.next_turn(turns, part.len(), index);
                 }
             }
         }
+    }
+
+    fn pass(&self, commands: wgpu::CommandBuffer) -> wgpu::SubmissionIndex {
+        let _held = self.turns.as_ref().map(|t| t.gate.pass());
+        self.queue.submit([commands])
     }
 
     /// Waits for the turn before the one that was just submitted, and makes the next as long as a turn should be.

@@ -3,6 +3,7 @@
 use super::canvas::{self, Shown, View};
 use super::session::{History, Recent, Session, Shot};
 use super::shortcuts::{self, Action};
+use super::surface::Surface;
 use super::worker::{Failure, News, Overlay, OverlayKey, OverlayKind, Picture, Ready, Request, Solved, Thumbnail, Workers};
 use super::{Chosen, Options, Program, blur, controls, export, strip};
 use crate::kernels::{Display, DisplayParams, Place};
@@ -168,6 +169,7 @@ pub struct App {
     pub(super) workers: Workers,
     inbox: mpsc::Receiver<News>,
     lost: Arc<AtomicBool>,
+    surface: Surface,
     kept: Arc<Mutex<Kept>>,
     screenshot: Option<PathBuf>,
     /// The picture of the window, when it has come.
@@ -234,6 +236,7 @@ impl App {
             flag.store(true, Ordering::Relaxed);
             ctx.request_repaint();
         });
+        let surface = Surface::on(&render.device, context);
         let (sender, inbox) = mpsc::channel();
         let ctx = context.clone();
         let tell = Arc::new(move |news| {
@@ -241,7 +244,7 @@ impl App {
             let _ = sender.send(news);
             ctx.request_repaint();
         });
-        let workers = Workers::start(&render.adapter, &render.device, &render.queue, program.clone(), tell);
+        let workers = Workers::start(&render.adapter, &render.device, &render.queue, surface.gate(), program.clone(), tell);
         if let Some(light) = options.light {
             context.set_theme(if light { egui::Theme::Light } else { egui::Theme::Dark });
         }
@@ -251,6 +254,7 @@ impl App {
             workers,
             inbox,
             lost,
+            surface,
             kept,
             screenshot: options.screenshot.clone(),
             taken: Arc::default(),
@@ -329,6 +333,11 @@ impl App {
     /// Points per pixel of the frame; `None` while the whole frame fits.
     pub fn zoom(&self) -> Option<f32> {
         self.view.zoom
+    }
+
+    /// Pixel of the full frame under the pointer.
+    pub fn probed(&self) -> Option<(usize, usize)> {
+        self.probe
     }
 
     /// The overlay that is chosen.
@@ -926,7 +935,8 @@ impl eframe::App for App {
         self.think(ctx);
     }
 
-    fn ui(&mut self, ui: &mut egui::Ui, _frame: &mut eframe::Frame) {
+    fn ui(&mut self, ui: &mut egui::Ui, frame: &mut eframe::Frame) {
+        self.surface.configure(frame, ui.ctx());
         self.show(ui);
     }
 }

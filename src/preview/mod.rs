@@ -13,6 +13,7 @@ mod export;
 pub mod session;
 pub mod shortcuts;
 pub mod strip;
+mod surface;
 pub mod worker;
 
 pub use app::App;

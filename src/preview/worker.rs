@@ -6,7 +6,7 @@ use crate::baseline;
 use crate::colour;
 use crate::error::Error;
 use crate::exposure::Bracket;
-use crate::gpu::Gpu;
+use crate::gpu::{Gate, Gpu};
 use crate::image::{Plane, Rgb};
 use crate::io::input;
 use crate::kernels::{Channels, Place};
@@ -242,15 +242,16 @@ pub struct Workers {
 }
 
 impl Workers {
-    /// Starts them on a device that the window draws on; `tell` is called from both.
+    /// Starts them on a device that the window draws on, to which they submit while `gate` is open; `tell` is called from both.
     pub fn start(
         adapter: &wgpu::Adapter,
         device: &wgpu::Device,
         queue: &wgpu::Queue,
+        gate: &Arc<Gate>,
         program: Arc<dyn Program>,
         tell: Arc<dyn Fn(News) + Send + Sync>,
     ) -> Self {
-        let gpu = || Gpu::shared(adapter, device.clone(), queue.clone());
+        let gpu = || Gpu::shared(adapter, device.clone(), queue.clone(), gate.clone());
         let (solve, requests) = mpsc::channel::<Request>();
         let (tasks, orders) = mpsc::channel::<Task>();
         let software = adapter.get_info().device_type == wgpu::DeviceType::Cpu;

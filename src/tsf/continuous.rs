@@ -33,6 +33,11 @@ const SUM: f64 = 30.0;
 /// not say.
 const PERSPECTIVE: f64 = 2.0;
 
+/// Mean of the squares of `values`.
+pub(super) fn mean_square(values: &[f32]) -> f64 {
+    values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / values.len().max(1) as f64
+}
+
 impl<'a> Evidence<'a> {
     pub fn new(frame: &WholeFrame<'a>, rows: &[Row]) -> Self {
         let (w, h) = frame.size();
@@ -86,6 +91,11 @@ impl<'a> Evidence<'a> {
             }
         }
         r
+    }
+
+    /// Mean square of [`Evidence::residual`].
+    pub fn misfit(&self, tsf: &Tsf) -> f64 {
+        mean_square(&self.residual(tsf))
     }
 
     /// Sparse non-negative weights of `poses` (eq. 6 against the frame instead of PSFs). λ is the level that the gradient of noise alone

@@ -4,7 +4,7 @@
 //! the level before: first which poses of a lattice of one pixel (eq. 6, against the frame itself), then their continuous positions.
 
 use super::Tsf;
-use super::continuous::Evidence;
+use super::continuous::{Evidence, mean_square};
 use super::from_psfs::nominal_focal;
 use super::model::{Chart, Coordinates, Model};
 use super::whole_frame::{Row, WholeFrame};
@@ -122,11 +122,6 @@ impl Level {
             base: s * frame.base * s.inverse(),
         }
     }
-}
-
-fn scaled(tsf: &Tsf, factor: f64) -> Tsf {
-    let poses = tsf.poses.iter().map(|p| Pose { t_x: p.t_x * factor, t_y: p.t_y * factor, ..*p }).collect();
-    Tsf { focal_px: tsf.focal_px * factor, poses, base: DMat3::IDENTITY }
 }
 
 /// Extent in pixels, the largest over corners and centre, of what the TSF does to a point: all but the outermost hundredth of its time on
@@ -261,8 +256,7 @@ const LINK: f64 = 3.0;
 fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
     let held = HeldOut::of(rows, frame.size());
     let fitted = |evidence: &Evidence, (sparsity, connected): (f64, bool)| {
-        let left = evidence.residual(tsf).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / evidence.targets().len().max(1) as f64;
-        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * left.sqrt())?;
+        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * evidence.misfit(tsf).sqrt())?;
         if connected { main_path(&found, chart) } else { Some(found) }
     };
     let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
@@ -312,7 +306,7 @@ impl WholeFrame<'_> {
         let coarse = level(count);
         let (cw, ch) = coarse.size();
         let grid = PoseGrid::new(cw, ch, RADIUS.min(cw.min(ch) / 5), DEGREES, 1.0);
-        let mut tsf = scaled(&coarse.fit_grid(&grid, None)?, (1 << count) as f64);
+        let mut tsf = coarse.fit_grid(&grid, None)?.scaled((1 << count) as f64);
         tsf.focal_px = focal;
         // Pitch and yaw show only at the finest level.
         let planar = if search.model == Model::Translation { Model::Translation } else { Model::Rigid };
@@ -325,7 +319,7 @@ impl WholeFrame<'_> {
             let frame = level(l);
             let (fw, fh) = frame.size();
             let chart = Chart::new(planar, focal / scale, fw, fh);
-            let mut here = scaled(&tsf, 1.0 / scale);
+            let mut here = tsf.scaled(1.0 / scale);
             let margin = margin(&here, (fw, fh));
             let rows = frame.rows(ROWS / 2, margin);
             if l < count {
@@ -335,7 +329,7 @@ impl WholeFrame<'_> {
             here = gathered(&here, &chart)?;
             let rows = frame.rows(ROWS, margin);
             here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
-            tsf = scaled(&here, scale);
+            tsf = here.scaled(scale);
             if l == 0 || extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
                 break;
             }
@@ -357,7 +351,7 @@ impl WholeFrame<'_> {
         let scale = f64::from(1 << l);
         let size = frame.size();
         let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
-        let Some(start) = gathered(&scaled(tsf, 1.0 / scale), &chart) else { return tsf.clone() };
+        let Some(start) = gathered(&tsf.scaled(1.0 / scale), &chart) else { return tsf.clone() };
         let rows = frame.rows(ROWS, margin(&start, size));
         filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale).about(self.base)
     }
@@ -370,8 +364,7 @@ impl WholeFrame<'_> {
         let chart = Chart::new(Model::Rigid, start.focal_px, w, h);
         let rows = self.rows(ROWS / 2, margin(start, (w, h)));
         let evidence = Evidence::new(self, &rows);
-        let left = evidence.residual(start).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / rows.len().max(1) as f64;
-        evidence.weigh(&around(start, &chart, 1.0), chart.focal, 2.0 * left.sqrt())
+        evidence.weigh(&around(start, &chart, 1.0), chart.focal, 2.0 * evidence.misfit(start).sqrt())
     }
 
     /// The coarser levels of the pyramid: 1/2, 1/4, ...
@@ -389,7 +382,7 @@ impl WholeFrame<'_> {
 fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) -> Estimate {
     let scale = (1 << l) as f64;
     let (w, h) = frame.size();
-    let start = scaled(tsf, 1.0 / scale);
+    let start = tsf.scaled(1.0 / scale);
     let all = frame.rows(ROWS, margin(&start, (w, h)));
     let fit = |rows: &[Row], model: Model, focal: f64, from: &Tsf, iterations: usize| {
         let iterations = if search.is_stopped() { 0 } else { iterations };
@@ -442,17 +435,15 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
     }
     let here = fit(&all, model, chosen_focal, &start, 10);
     let evidence = Evidence::new(frame, &all);
-    let energy = |r: &[f32]| r.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
-    let left = energy(&evidence.residual(&here));
-    let residual = left / all.len().max(1) as f64;
+    let residual = evidence.misfit(&here);
     let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
-    let evidence = (energy(evidence.targets()) - left) / numbers as f64;
+    let evidence = (mean_square(evidence.targets()) - residual) * all.len() as f64 / numbers as f64;
     Estimate { tsf: filled(&here, scale), model, focal: source, trials, scale: 1 << l, residual, evidence }
 }
 
 /// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.
 pub fn filled(tsf: &Tsf, factor: f64) -> Tsf {
-    let mut out = scaled(tsf, factor);
+    let mut out = tsf.scaled(factor);
     let n = factor as i32;
     if n > 1 {
         let tent = |k: i32| f64::from(n - k.abs()) / f64::from(n * n);

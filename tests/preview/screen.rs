@@ -52,6 +52,40 @@ fn a_real_window_shows_the_loaded_result_and_saves_its_picture() {
     }
 }
 
+#[cfg(target_os = "linux")]
+#[test]
+fn a_window_that_is_resized_while_it_solves_stays_open() {
+    use x11rb::connection::Connection;
+    use x11rb::protocol::xproto::{ConfigureWindowAux, ConnectionExt, MapState, Window};
+    let folder = tempfile::tempdir().unwrap();
+    let files = frames(folder.path(), Times::Exif);
+    let screen = Screen::open();
+    let picture = folder.path().join("window.png");
+    let mut program = Command::new(env!("CARGO_BIN_EXE_unshaken"));
+    program.args(["preview", "--size", "1000x700", "--screenshot"]).arg(&picture).args(&files);
+    program.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").env("XDG_STATE_HOME", folder.path());
+    let mut run = program.stderr(Stdio::piped()).spawn().unwrap();
+
+    let (x, number) = x11rb::connect(Some(&screen.name)).unwrap();
+    let root = x.setup().roots[number].root;
+    let shown = |w: &Window| x.get_window_attributes(*w).unwrap().reply().is_ok_and(|a| a.map_state == MapState::VIEWABLE);
+    let mut times = 0;
+    while run.try_wait().unwrap().is_none() {
+        let children = x.query_tree(root).unwrap().reply().unwrap().children;
+        for window in children.into_iter().filter(shown) {
+            let size = ConfigureWindowAux::new().width(if times % 2 == 0 { 820 } else { 1000 }).height(700);
+            x.configure_window(window, &size).unwrap();
+            times += 1;
+        }
+        x.flush().unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(120));
+    }
+    let ended = run.wait_with_output().unwrap();
+    assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stderr));
+    assert!(times > 5, "{times} times");
+    assert!(picture.exists());
+}
+
 #[test]
 fn without_a_screen_the_message_says_so() {
     let run =

@@ -1,7 +1,7 @@
 use super::support::{SIZE, Times, Window, frames};
 use egui::{Key, Modifiers, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -34,6 +34,132 @@ fn an_empty_window_says_what_to_do() {
     window.harness.key_press(Key::Escape);
     window.harness.run_steps(3);
     assert!(window.harness.query_by_label("Half a stop brighter").is_none(), "Escape closes the sheet");
+}
+
+/// A file as the desktop hands it over.
+#[derive(Debug)]
+struct Dropped(PathBuf);
+
+impl egui::DroppedFile for Dropped {
+    fn path(&self) -> &Path {
+        &self.0
+    }
+
+    fn bytes(&self) -> Result<Vec<u8>, String> {
+        std::fs::read(&self.0).map_err(|e| e.to_string())
+    }
+}
+
+/// Moves the pointer from `from` to `to` with the button held.
+fn drag(window: &mut Window, from: Pos2, to: Pos2) {
+    window.harness.hover_at(from);
+    window.harness.run_steps(2);
+    window.harness.drag_at(from);
+    window.harness.run_steps(2);
+    // Beyond what counts as a click first.
+    window.harness.hover_at(from + 0.5 * (to - from));
+    window.harness.run_steps(2);
+    window.harness.hover_at(to);
+    window.harness.run_steps(2);
+    window.harness.drop_at(to);
+    window.harness.run_steps(3);
+}
+
+/// The pixel of the frame that the window tells of while the pointer is at `at`.
+#[track_caller]
+fn probed(window: &mut Window, at: Pos2) -> (i32, i32) {
+    window.harness.hover_at(at);
+    window.harness.run_steps(2);
+    let (x, y) = window.app().probed().expect("the pointer is over the frame");
+    assert!(window.harness.query_by_label(&format!("at {x}, {y}")).is_some(), "{x}, {y} is not said");
+    (x as i32, y as i32)
+}
+
+#[test]
+fn frames_are_dropped_probed_zoomed_and_moved() {
+    let (_folder, files) = bracket();
+    let mut window = Window::open(&[]);
+    window.harness.run_steps(2);
+    window.harness.input_mut().dropped_files = files.iter().map(|f| Arc::new(Dropped(f.clone())) as egui::DroppedFileHandle).collect();
+    window.harness.run_steps(2);
+    assert_eq!(window.app().session().shots.len(), 3, "dropped");
+    window.solve();
+    window.harness.get_by_label("Pixel").scroll_to_me();
+    window.harness.run_steps(4);
+
+    // The probe tells the pixel under the pointer as the files have it.
+    let view = window.harness.get_by_label("Main view").rect();
+    let at = view.center() + Vec2::new(70.0, 30.0);
+    let (x, y) = probed(&mut window, at);
+    let frame = image::open(&files[1]).unwrap().into_rgb8();
+    let zoom = (view.width() / frame.width() as f32).min(view.height() / frame.height() as f32);
+    let expected = Vec2::new(frame.width() as f32, frame.height() as f32) * 0.5 + (at - view.center()) / zoom;
+    assert_eq!((x, y), (expected.x as i32, expected.y as i32));
+    for code in frame.get_pixel(x as u32, y as u32).0 {
+        let text = format!("{code}.0");
+        assert!(window.harness.query_all_by_label(&text).next().is_some(), "{text} of frame 2 at {x}, {y}");
+    }
+    assert!(window.harness.query_all_by_label_contains("mask ").count() >= 3, "the masks of all frames");
+
+    // The pixel under the pointer stays there while the wheel turns.
+    window.harness.hover_at(at);
+    window.harness.event(egui::Event::MouseWheel {
+        unit: egui::MouseWheelUnit::Point,
+        delta: Vec2::new(0.0, 120.0),
+        phase: egui::TouchPhase::Move,
+        source: egui::MouseWheelSource::Unknown,
+        modifiers: Modifiers::NONE,
+    });
+    window.harness.run_steps(30);
+    let near = window.app().zoom().expect("zoomed");
+    assert!(near > 1.2 * zoom, "{near} points per pixel, {zoom} before");
+    let still = probed(&mut window, at);
+    assert!((still.0 - x).abs() <= 1 && (still.1 - y).abs() <= 1, "{still:?}, ({x}, {y}) before");
+
+    // A drag carries the picture along.
+    let to = at + Vec2::new(-60.0, 40.0);
+    drag(&mut window, at, to);
+    let carried = probed(&mut window, to);
+    assert!((carried.0 - still.0).abs() <= 1 && (carried.1 - still.1).abs() <= 1, "{carried:?}, {still:?} before");
+    window.harness.key_press(Key::F);
+    window.harness.run_steps(3);
+    assert_eq!(window.app().zoom(), None, "the whole frame again");
+
+    // Patches: added by a click, moved by a drag, removed by the other button.
+    window.harness.key_press(Key::B);
+    window.harness.run_steps(4);
+    window.harness.hover_at(at);
+    window.harness.drag_at(at);
+    window.harness.drop_at(at);
+    window.harness.run_steps(3);
+    assert_eq!(window.app().session().patches, [(x as usize, y as usize)]);
+    // Messages that the click made obsolete no longer take room.
+    let now = window.harness.get_by_label("Main view").rect();
+    let zoom = (now.width() / frame.width() as f32).min(now.height() / frame.height() as f32);
+    let place = |p: Vec2| now.center() + (p - 0.5 * Vec2::new(frame.width() as f32, frame.height() as f32)) * zoom;
+    let (from, to) = (place(expected), place(expected + Vec2::new(-9.0, 6.0)));
+    drag(&mut window, from, to);
+    let moved = window.app().session().patches[0];
+    let wanted = expected + Vec2::new(-9.0, 6.0);
+    assert!(
+        (moved.0 as f32 + 0.5 - wanted.x).abs() <= 1.0 && (moved.1 as f32 + 0.5 - wanted.y).abs() <= 1.0,
+        "{moved:?}, {wanted:?} wanted"
+    );
+    assert_eq!(window.app().zoom(), None, "a drag of a patch does not move the picture");
+    window.harness.hover_at(to);
+    for pressed in [true, false] {
+        window.harness.event(egui::Event::PointerButton {
+            pos: to,
+            button: egui::PointerButton::Secondary,
+            pressed,
+            modifiers: Modifiers::NONE,
+        });
+        window.harness.run_steps(2);
+    }
+    assert!(window.app().session().patches.is_empty(), "removed");
+    window.harness.key_press_modifiers(Modifiers::COMMAND, Key::Z);
+    window.harness.run_steps(3);
+    assert_eq!(window.app().session().patches, [moved], "and taken back");
 }
 
 /// One solution, and everything that needs one: a device and a solve are dear.
@@ -156,6 +282,27 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
         window.harness.step();
     }
     assert!(target.exists() && target.with_extension("png").exists() && target.with_extension("json").exists());
+    // The same as TIFF, with a page.
+    let tiff = folder.path().join("seen.tif");
+    window.harness.get_by_label("Linear result").focus();
+    window.harness.key_press_modifiers(Modifiers::COMMAND, Key::A);
+    window.harness.get_by_label("Linear result").type_text(&tiff.display().to_string());
+    window.harness.run_steps(3);
+    for label in ["Report page (HTML)", "Replace files that exist", "Write the files"] {
+        click(&mut window, label);
+    }
+    let page = tiff.with_extension("html");
+    let end = Instant::now() + Duration::from_secs(30);
+    while !page.exists() && Instant::now() < end {
+        std::thread::sleep(Duration::from_millis(30));
+        window.harness.step();
+    }
+    assert!(std::fs::read_to_string(&page).unwrap().contains("<html"));
+    let read = unshaken::io::input::read(&tiff, 1.0).unwrap().intensity;
+    for (a, b) in read.0.iter().zip(pixels(&target)) {
+        assert!(a.data.iter().zip(&b).all(|(a, b)| (a - b.clamp(0.0, 1.0)).abs() <= 1e-6), "TIFF and OpenEXR hold the same");
+    }
+
     let own = folder.path().join("headless.exr");
     let line = window.app().session().arguments(&[None; 3], &own);
     let run = Command::new(env!("CARGO_BIN_EXE_unshaken")).args(["merge", "--quiet"]).args(line).output().unwrap();
