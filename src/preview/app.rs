@@ -1,11 +1,11 @@
 //! The window's state, and what its parts do to it.
 
 use super::canvas::{self, Shown, View};
+use super::device::Device;
 use super::session::{History, Recent, Session, Shot};
 use super::shortcuts::{self, Action};
-use super::surface::Surface;
 use super::worker::{Failure, News, Overlay, OverlayKey, OverlayKind, Picture, Ready, Request, Solved, Thumbnail, Workers};
-use super::{Chosen, Options, Program, blur, controls, export, strip};
+use super::{Chosen, Options, Program, blur, controls, export, strip, words};
 use crate::kernels::{Display, DisplayParams, Place};
 use crate::pipeline::Estimate;
 use crate::tonemap::{Light, Operator};
@@ -168,8 +168,7 @@ pub struct App {
     pub(super) program: Arc<dyn Program>,
     pub(super) workers: Workers,
     inbox: mpsc::Receiver<News>,
-    lost: Arc<AtomicBool>,
-    surface: Surface,
+    device: Device,
     kept: Arc<Mutex<Kept>>,
     screenshot: Option<PathBuf>,
     /// The picture of the window, when it has come.
@@ -230,13 +229,7 @@ impl App {
         kept: Arc<Mutex<Kept>>,
     ) -> Self {
         render.renderer.write().callback_resources.insert(Display::new(&render.device, render.target_format));
-        let lost = Arc::new(AtomicBool::new(false));
-        let (flag, ctx) = (lost.clone(), context.clone());
-        render.device.set_device_lost_callback(move |_, _| {
-            flag.store(true, Ordering::Relaxed);
-            ctx.request_repaint();
-        });
-        let surface = Surface::on(&render.device, context);
+        let device = Device::heard(&render.device, context);
         let (sender, inbox) = mpsc::channel();
         let ctx = context.clone();
         let tell = Arc::new(move |news| {
@@ -244,7 +237,7 @@ impl App {
             let _ = sender.send(news);
             ctx.request_repaint();
         });
-        let workers = Workers::start(&render.adapter, &render.device, &render.queue, surface.gate(), program.clone(), tell);
+        let workers = Workers::start(&render.adapter, &render.device, &render.queue, device.gate(), program.clone(), tell);
         if let Some(light) = options.light {
             context.set_theme(if light { egui::Theme::Light } else { egui::Theme::Dark });
         }
@@ -253,8 +246,7 @@ impl App {
             program,
             workers,
             inbox,
-            lost,
-            surface,
+            device,
             kept,
             screenshot: options.screenshot.clone(),
             taken: Arc::default(),
@@ -345,23 +337,19 @@ impl App {
         self.over
     }
 
-    /// Says that the device is gone, as its driver would.
-    pub fn lose_device(&self) {
-        self.lost.store(true, Ordering::Relaxed);
-    }
-
     pub(super) fn say(&mut self, text: impl Into<String>, error: bool, offer: Option<Offer>) {
-        let text = text.into();
-        if !self.messages.iter().any(|m| m.text == text) {
-            self.messages.push(Message { text, error, offer, passing: false });
-        }
+        self.put(Message { text: text.into(), error, offer, passing: false });
     }
 
     /// Says what the next solution makes obsolete.
     fn say_of_solution(&mut self, text: String, error: bool, offer: Option<Offer>) {
-        self.say(text, error, offer);
-        if let Some(last) = self.messages.last_mut() {
-            last.passing = true;
+        self.put(Message { text, error, offer, passing: true });
+    }
+
+    fn put(&mut self, message: Message) {
+        let text = words::in_window(&message.text);
+        if !self.messages.iter().any(|m| m.text == text) {
+            self.messages.push(Message { text, ..message });
         }
     }
 
@@ -579,7 +567,7 @@ impl App {
             }
             News::Written(outcome) => {
                 self.form.busy = false;
-                self.form.last = Some(outcome);
+                self.form.last = Some(outcome.map_err(|text| words::in_window(&text)));
             }
             News::Chosen(Chosen::Open(files)) => self.open(files),
             News::Chosen(Chosen::Add(files)) => self.add(files),
@@ -936,7 +924,7 @@ impl eframe::App for App {
     }
 
     fn ui(&mut self, ui: &mut egui::Ui, frame: &mut eframe::Frame) {
-        self.surface.configure(frame, ui.ctx());
+        self.device.configure_surface(frame, ui.ctx());
         self.show(ui);
     }
 }
@@ -952,7 +940,7 @@ impl App {
                 self.workers.thumbnail(shot.path.clone());
             }
         }
-        if self.lost.swap(false, Ordering::Relaxed) {
+        if self.device.is_lost() {
             self.reopen(ctx);
         }
         let now = ctx.input(|i| i.time);

@@ -9,11 +9,12 @@ pub mod app;
 pub mod blur;
 mod canvas;
 mod controls;
+mod device;
 mod export;
 pub mod session;
 pub mod shortcuts;
 pub mod strip;
-mod surface;
+pub mod words;
 pub mod worker;
 
 pub use app::App;

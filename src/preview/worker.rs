@@ -396,12 +396,17 @@ impl Solver {
             let start = Instant::now();
             let mut warnings = Vec::new();
             self.engine.forget_run();
+            let mut settings = settings.reduced(divisor);
+            if divisor > session.parameters.divisor.max(1) {
+                // Reduced frames have less noise and shorter blurs: half the iterations show what there is to see.
+                settings.deblur.inner = settings.deblur.inner.div_ceil(2);
+            }
             let outcome = pipeline::merge_with(
                 &mut self.engine,
                 &format!("{name} 1/{divisor}"),
                 &bracket,
                 &ready.opened.response,
-                &settings.reduced(divisor),
+                &settings,
                 None,
                 &mut |event| {
                     if let Event::Warning(text) = &event {

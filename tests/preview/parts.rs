@@ -5,6 +5,7 @@ use unshaken::pose::Pose;
 use unshaken::preview::blur::{nice, psf_at, tree};
 use unshaken::preview::shortcuts::KEYS;
 use unshaken::preview::strip::{seconds, time};
+use unshaken::preview::words::{CONTROLS, in_window};
 use unshaken::preview::worker::{BINS_PER_STOP, Histogram, divisors};
 use unshaken::tsf::Tsf;
 
@@ -70,4 +71,18 @@ fn a_histogram_counts_every_lit_pixel_once() {
     }
     assert_eq!(found.first, -2.0);
     assert_eq!(found.bins[1][5 * BINS_PER_STOP], 0.25, "8 lies five stops above a quarter");
+}
+
+#[test]
+fn options_become_controls_and_nothing_else_changes() {
+    let said = in_window("use a larger --scale, or --scale=1; --tsf stays -- as this does");
+    assert_eq!(said, "use a larger \"Size\", or \"Size\"=1; --tsf stays -- as this does");
+    assert_eq!(in_window("(--no-align takes it as it lies)"), "(\"Register the frames\" switched off takes it as it lies)");
+    assert_eq!(in_window("--scaled"), "--scaled");
+    assert_eq!(in_window("é--"), "é--");
+    let help = std::process::Command::new(env!("CARGO_BIN_EXE_unshaken")).args(["merge", "--help"]).output().unwrap();
+    let help = String::from_utf8(help.stdout).unwrap();
+    for (option, _) in CONTROLS {
+        assert!(help.contains(&format!("{option} ")) || help.contains(&format!("{option}\n")), "{option}");
+    }
 }
