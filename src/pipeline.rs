@@ -488,7 +488,7 @@ impl Run<'_> {
         if merged_only {
             self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || doubted.is_some() || (!all_known && !sharp.contains(&true)) {
-            let (found, motions, blind, degraded) = self.remembered(
+            let ((found, moved), motions, blind, degraded) = self.remembered(
                 "all blurs",
                 "",
                 |_| 0,
@@ -508,7 +508,21 @@ impl Run<'_> {
                         tsfs[i] = Some(tsf);
                     }
                 }
-                None => unexplained = doubted.is_none(),
+                None => {
+                    let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+                    match blind::settled(&passing, &moved) {
+                        _ if doubted.is_none() => unexplained = true,
+                        Some(still) => sharp.iter_mut().enumerate().for_each(|(i, s)| *s = still.contains(&i)),
+                        None => {
+                            self.degrade(
+                                "every frame that could be sharp seems to have moved, and camera shake does not explain the frames: they are \
+                                 merged without deblurring, the least blurred weighted most (--sharp names frames that are sharp)"
+                                    .into(),
+                            )?;
+                            unexplained = true;
+                        }
+                    }
+                }
             }
         } else if !sharp.contains(&true) {
             scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);
@@ -532,7 +546,7 @@ impl Run<'_> {
         }
         self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
         if unexplained {
-            self.prefer_detail(|i| verdicts[i].detail);
+            self.prefer_detail(|i| verdicts[i].detail.powi(2));
         }
         let mut details: Vec<Value> = vec![Value::Null; frames.len()];
 

@@ -17,6 +17,9 @@ pub struct Verdict {
     /// Energy of one-pixel differences over that of the frame with most of it, relative to the same ratio of coarse differences, worst
     /// direction, where both see the same light: 1 for equally sharp frames.
     pub detail: f64,
+    /// Whether fine structure of it or of another frame stood clear of the noise of both where they see the same light: else `detail` says
+    /// nothing.
+    pub compared: bool,
     /// Energy of one-pixel over that of two-pixel differences, worst direction: about 0.5 where edges are one pixel wide, 0.25 where
     /// they are ramps.
     pub steepness: f64,
@@ -194,8 +197,9 @@ fn share(own: &Energy, other: &Energy) -> Option<f64> {
     Some(share + 2.0 * scatter.sqrt() / other.sum)
 }
 
-/// [`Verdict::detail`] of two frames against each other, `motion` being the way from the first's pixels to the second's.
-fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [f64; 2] {
+/// [`Verdict::detail`] of two frames against each other, `motion` being the way from the first's pixels to the second's; `None` where nothing
+/// tells.
+fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [Option<f64>; 2] {
     // Each of the two on its own pixels, of which those count that the other sees as well.
     let apart = *motion != DMat3::IDENTITY;
     let (b_seen, a_seen) = (apart.then(|| b.seen(motion)), apart.then(|| a.seen(&motion.inverse())));
@@ -208,9 +212,10 @@ fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [f64; 2] {
         // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
         let known = coarse[0].sum > 0.0 && coarse[1].sum > 0.0;
         let contrast = |i: usize, j: usize| if known { (coarse[i].sum / coarse[j].sum).min(1.0) } else { 1.0 };
-        [(0, 1), (1, 0)].map(|(i, j)| share(&fine[i], &fine[j]).map_or(1.0, |share| share / contrast(i, j)))
+        [(0, 1), (1, 0)].map(|(i, j)| share(&fine[i], &fine[j]).map(|share| share / contrast(i, j)))
     };
-    DIRECTIONS.par_iter().map(along).reduce(|| [1.0; 2], |x, y| [x[0].min(y[0]), x[1].min(y[1])])
+    let least = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::min);
+    DIRECTIONS.par_iter().map(along).reduce(|| [None; 2], |x, y| [least(x[0], y[0]), least(x[1], y[1])])
 }
 
 /// [`Verdict::steepness`].
@@ -234,18 +239,23 @@ pub fn triage(
     motions: &[DMat3],
 ) -> Vec<Verdict> {
     let mut all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
-    let verdict = |a| Verdict { sharp: false, detail: 1.0, steepness: steepness(a), reason: String::new() };
+    let verdict = |a| Verdict { sharp: false, detail: 1.0, compared: false, steepness: steepness(a), reason: String::new() };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
     all.iter_mut().for_each(Luminance::correct);
     // A frame that is left out is measured against the others, not they against it. One pair after the other: each takes several planes.
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
-    let found: Vec<[f64; 2]> = pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
+    let found: Vec<[Option<f64>; 2]> =
+        pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
         for (k, own, other) in [(0, i, j), (1, j, i)] {
-            if !excluded[other] {
-                verdicts[own].detail = verdicts[own].detail.min(detail[k]);
+            if !excluded[other]
+                && let Some(detail) = detail[k]
+            {
+                verdicts[own].detail = verdicts[own].detail.min(detail);
+                verdicts[own].compared = true;
+                verdicts[other].compared = true;
             }
         }
     }
@@ -262,6 +272,13 @@ pub fn triage(
         } else {
             v.sharp = true;
             v.reason = format!("fine structure {:.0} % of the best frame's, steepness {:.2}", 100.0 * v.detail, v.steepness);
+        }
+    }
+    // Deblurring a sharp frame loses next to nothing, taking a blurred one for sharp spoils the picture.
+    if given.is_none() && verdicts.iter().any(|v| v.sharp && v.compared) {
+        for v in verdicts.iter_mut().filter(|v| v.sharp && !v.compared) {
+            v.sharp = false;
+            v.reason = "shows no structure that a sharp frame sees clearly as well, to tell whether it is sharp".into();
         }
     }
     verdicts

@@ -50,6 +50,9 @@ const LEAST_DETAIL: f64 = 0.1;
 const SURELY_STEEP: f64 = 0.57;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
+/// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
+/// measure up to 1.6.
+const SURELY_SHAKEN: f64 = 3.0;
 
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
@@ -66,6 +69,17 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
         return None;
     }
     Some(if passing.len() > 1 { passing } else { used.to_vec() })
+}
+
+/// The frames that stay sharp of those that pass for it (`passing`), where a look at them found that `moved` did and no joint estimate is
+/// believed; `None`: none does. One alone stays: that it moved is not believed either.
+pub(super) fn settled(passing: &[usize], moved: &[usize]) -> Option<Vec<usize>> {
+    let still: Vec<usize> = passing.iter().copied().filter(|i| !moved.contains(i)).collect();
+    match (still.is_empty(), passing.len()) {
+        (false, _) => Some(still),
+        (true, 1) => Some(passing.to_vec()),
+        (true, _) => None,
+    }
 }
 
 impl Run<'_> {
@@ -114,14 +128,32 @@ impl Run<'_> {
     }
 
     /// The TSFs of all of the frames `used` and a scene to start from; `None` when a merge explains them as well or, where the triage was
-    /// in doubt about the frames `doubted`, one of them hardly moved. Progress runs from `from` to `to`.
-    pub(super) fn all_blurs(&mut self, used: &[usize], doubted: Option<&[usize]>, from: f32, to: f32) -> Result<Option<Found>> {
+    /// in doubt about the frames `doubted`, one of them hardly moved: then those of them that did. Progress runs from `from` to `to`.
+    pub(super) fn all_blurs(
+        &mut self,
+        used: &[usize],
+        doubted: Option<&[usize]>,
+        from: f32,
+        to: f32,
+    ) -> Result<(Option<Found>, Vec<usize>)> {
         if self.settings.blind == Blind::Patches {
-            return self.patches(used, from, to);
+            return Ok((self.patches(used, from, to)?, Vec::new()));
         }
-        let Some(doubted) = doubted else { return self.joint(used, false, from, to) };
-        let at = from + 0.3 * (to - from);
-        if self.all_moved(doubted, from, at)? { self.joint(used, true, at, to) } else { Ok(None) }
+        let Some(doubted) = doubted else { return Ok((self.joint(used, false, from, to)?, Vec::new())) };
+        let at = |part: f32| from + part * (to - from);
+        let all_moved = |extents: &[f64]| !extents.is_empty() && extents.iter().all(|e| *e > SHAKEN);
+        let extents = self.coarse_extents(doubted, from, at(0.2))?;
+        let shaken: Vec<usize> = doubted.iter().zip(&extents).filter(|(_, e)| **e > SURELY_SHAKEN).map(|(i, _)| *i).collect();
+        let mut none_still = all_moved(&extents);
+        if !none_still && !shaken.is_empty() && doubted.len() - shaken.len() == 1 && doubted.len() < used.len() {
+            // One alone stands still beside another's motion, whatever it did itself: the others tell.
+            none_still = all_moved(&self.coarse_extents(used, at(0.2), at(0.3))?);
+        }
+        if !none_still {
+            return Ok((None, shaken));
+        }
+        let found = self.joint(used, true, at(0.3), to)?;
+        Ok((found, doubted.to_vec()))
     }
 
     /// Frame of `used` to start from, and the next best: the shortest are nearly always the least blurred.
@@ -136,11 +168,11 @@ impl Run<'_> {
         order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
-    /// Whether every one of `frames`, which pass for sharp, moved while it was exposed: the joint estimate of a part of the frame with much
-    /// texture, at its coarsest level.
-    fn all_moved(&mut self, frames: &[usize], from: f32, to: f32) -> Result<bool> {
+    /// Extents in pixels of the blurs of `frames`: by the joint estimate of a part of the frame with much texture, at its coarsest level. Empty
+    /// where that cannot be told.
+    fn coarse_extents(&mut self, frames: &[usize], from: f32, to: f32) -> Result<Vec<f64>> {
         if frames.len() < 2 {
-            return Ok(false);
+            return Ok(Vec::new());
         }
         let (w, h) = self.bracket.size();
         // Where each frame's window lies, from the reference's: to the pixel.
@@ -153,14 +185,14 @@ impl Run<'_> {
         let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
         let (ww, wh) = (longest(rw, rh), longest(rh, rw));
         if ww.min(wh) < LEAST_WINDOW {
-            return Ok(false);
+            return Ok(Vec::new());
         }
         let (mx, my) = (most.x as usize, most.y as usize);
         let masks = self.all_masks();
         let first = self.luminance_frame(frames[0], &masks);
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);
-        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(false) };
+        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(Vec::new()) };
         let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
         let centre = DVec2::new((x + ww / 2) as f64, (y + wh / 2) as f64) - corner;
         let turned = |i: usize| {
@@ -171,7 +203,7 @@ impl Run<'_> {
             })
         };
         if frames.iter().any(|&i| turned(i)) {
-            return Ok(false);
+            return Ok(Vec::new());
         }
         let at = |i: usize| {
             let s = shift(i, centre);
@@ -192,10 +224,9 @@ impl Run<'_> {
             events(Event::Progress { stage, fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
-        let all = extents.iter().all(|e| *e > SHAKEN);
         let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
         self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": extents });
-        Ok(all)
+        Ok(extents)
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
@@ -312,5 +343,28 @@ impl Run<'_> {
     /// What the report says about a bracket without a sharp frame; null where there was one.
     pub(super) fn blind_report(&mut self) -> Value {
         std::mem::take(&mut self.blind)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_that_moved_are_sharp_no_more_and_one_alone_stays() {
+        assert_eq!(settled(&[0, 2], &[2]), Some(vec![0]));
+        assert_eq!(settled(&[0, 2, 3], &[]), Some(vec![0, 2, 3]));
+        assert_eq!(settled(&[0, 2], &[0, 2]), None);
+        assert_eq!(settled(&[1], &[0, 1, 2]), Some(vec![1]));
+    }
+
+    #[test]
+    fn doubt_is_about_frames_without_steep_edges() {
+        let verdict = |steepness| Verdict { sharp: true, detail: 1.0, compared: true, steepness, reason: String::new() };
+        let all = [verdict(0.45), verdict(0.5), verdict(0.3)];
+        assert_eq!(doubted(&all, &[true, true, false], &[0, 1, 2]), Some(vec![0, 1]));
+        assert_eq!(doubted(&all, &[true, false, false], &[0, 1, 2]), Some(vec![0, 1, 2]), "one alone is looked at with the others");
+        assert_eq!(doubted(&[verdict(0.45), verdict(0.6)], &[true, true], &[0, 1]), None, "one is surely sharp");
+        assert_eq!(doubted(&all, &[false; 3], &[0, 1, 2]), None);
     }
 }

@@ -196,6 +196,34 @@ fn trails_of_lamps_are_not_taken_for_fine_structure() {
     }
 }
 
+/// Two frames that see the left half clearly, and a long one that sees it white and the right half, which is noise to the others.
+#[test]
+fn a_frame_that_none_can_be_compared_with_is_not_taken_for_sharp() {
+    let level = noise::NoiseModel::from_electrons(4000.0, 8.0);
+    let (w, h) = (128, 96);
+    let grain = numbers(3, w * h);
+    let light = |x: usize, y: usize| (1.0 + 0.4 * f64::from(grain[y * w + x])) * if x < w / 2 { 1.0 } else { 5e-4 };
+    let frame = |exposure_time: f64, seed: u64| {
+        let n: Vec<f32> =
+            (0..12).map(|k| numbers(seed + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
+        let plane = Plane::from_fn(w, h, |x, y| {
+            let e = exposure_time * light(x, y);
+            (e + level.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0).clamp(0.0, 1.0) as f32
+        });
+        Frame { name: String::new(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time }
+    };
+    let sharp = |times: &[f64]| {
+        let frames: Vec<Frame> = times.iter().zip([10, 30, 50]).map(|(t, seed)| frame(*t, seed)).collect();
+        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+        let still = vec![DMat3::IDENTITY; times.len()];
+        let found = triage::triage(&frames, &exposures, &level, &vec![false; times.len()], None, &still);
+        found.iter().map(|v| (v.sharp, v.compared)).collect::<Vec<_>>()
+    };
+    assert_eq!(sharp(&[0.25, 0.5, 400.0]), [(true, true), (true, true), (false, false)]);
+    // A pair of which nothing can be told has the benefit of the doubt.
+    assert_eq!(sharp(&[0.25, 400.0]), [(true, false), (true, false)]);
+}
+
 #[test]
 fn shaken_frames_are_told_from_sharp_ones() {
     let scene = synth::room(192, 144, 24, 3);
