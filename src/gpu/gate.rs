@@ -30,8 +30,12 @@ impl Gate {
     /// Waits until submissions may pass; until the guard is dropped the gate cannot be shut.
     pub fn pass(&self) -> MutexGuard<'_, bool> {
         let shut = self.shut.lock().unwrap_or_else(PoisonError::into_inner);
-        let waited = self.opened.wait_timeout_while(shut, HELD, |shut| *shut);
-        waited.unwrap_or_else(PoisonError::into_inner).0
+        let (mut shut, waited) = self.opened.wait_timeout_while(shut, HELD, |shut| *shut).unwrap_or_else(PoisonError::into_inner);
+        if waited.timed_out() {
+            // It was forgotten.
+            *shut = false;
+        }
+        shut
     }
 }
 
@@ -63,5 +67,6 @@ mod tests {
         assert!(waiting.recv().unwrap() < HELD, "opened");
         gate.shut();
         assert!(passes(&gate).recv().unwrap() >= HELD, "forgotten");
+        assert!(passes(&gate).recv().unwrap() < HELD / 2, "and no longer shut");
     }
 }
