@@ -508,10 +508,10 @@ impl Run<'_> {
                         tsfs[i] = Some(tsf);
                     }
                 }
+                None if doubted.is_none() => unexplained = true,
                 None => {
                     let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
                     match blind::settled(&passing, &moved) {
-                        _ if doubted.is_none() => unexplained = true,
                         Some(still) => sharp.iter_mut().enumerate().for_each(|(i, s)| *s = still.contains(&i)),
                         None => {
                             self.degrade(
@@ -546,7 +546,7 @@ impl Run<'_> {
         }
         self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
         if unexplained {
-            self.prefer_detail(|i| verdicts[i].detail.powi(2));
+            self.prefer_detail(|i| verdicts[i].detail);
         }
         let mut details: Vec<Value> = vec![Value::Null; frames.len()];
 

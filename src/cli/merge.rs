@@ -27,11 +27,11 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
     let job = asked.read()?;
     let (text, quality) = with_progress(|events| {
         let mut opened = job.open(events)?;
-        let settings = job.settings(&opened)?.reduced(job.divisor);
-        let tsf = job.tsf.as_ref().map(|t| t.reduced(job.divisor));
-        if job.divisor > 1 {
+        let settings = job.settings(&opened)?.reduced(job.asked.divisor);
+        let tsf = job.tsf.as_ref().map(|t| t.reduced(job.asked.divisor));
+        if job.asked.divisor > 1 {
             // The frames themselves are not needed any more: their memory is.
-            opened.bracket = Arc::new(crate::response::reduced(&opened.bracket, &opened.response, job.divisor)?);
+            opened.bracket = Arc::new(crate::response::reduced(&opened.bracket, &opened.response, job.asked.divisor)?);
         }
         let mut warnings = Vec::new();
         let outcome = pipeline::merge(&opened.bracket, &opened.response, &settings, tsf.as_ref(), &mut |event| {
@@ -51,11 +51,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
 
 /// A merge as its arguments ask for it, understood and checked as far as this needs no pixels.
 pub(super) struct Job<'a> {
-    args: &'a MergeArgs,
-    times: Option<Vec<f64>>,
-    values: Option<Vec<f64>>,
-    settings: Settings,
-    divisor: usize,
+    asked: Asked<'a>,
     response: Option<Response>,
     tsf: Option<TsfFile>,
     photo: PhotoSettings,
@@ -133,27 +129,27 @@ impl<'a> Asked<'a> {
 
     /// Reads the files that say how, not yet the frames.
     pub fn read(self) -> anyhow::Result<Job<'a>> {
-        let Self { args, times, values, settings, divisor, named, response_file } = self;
+        let args = self.args;
         let photo = PhotoSettings::of(args)?;
-        let response = match (named, &response_file) {
-            (None, Some(path)) => Some(read_response(path)?),
-            (named, _) => named,
+        let response = match &self.response_file {
+            Some(path) => Some(read_response(path)?),
+            None => self.named.clone(),
         };
         let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
             check_tsf_names(file, path, &args.frames)?;
         }
-        Ok(Job { args, times, values, settings, divisor, response, tsf, photo })
+        Ok(Job { asked: self, response, tsf, photo })
     }
 }
 
 impl Job<'_> {
     /// Reads the frames and finds their response.
     pub fn open(&self, events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened> {
-        let args = self.args;
+        let args = self.asked.args;
         events(Event::Progress { stage: "reading frames".into(), fraction: 0.0 });
-        let mut loaded = frames::load(&args.frames, self.times.clone().or(self.values.clone()), self.photo.white)?;
-        if self.times.is_some() {
+        let mut loaded = frames::load(&args.frames, self.asked.times.clone().or(self.asked.values.clone()), self.photo.white)?;
+        if self.asked.times.is_some() {
             for (noted, frame) in loaded.metadata.iter_mut().zip(loaded.bracket.frames()) {
                 noted.exposure_time = Some(frame.exposure_time);
             }
@@ -174,7 +170,7 @@ impl Job<'_> {
             ))
             .into());
         }
-        let relative = self.values.is_some() || self.times.is_none() && metadata.iter().any(|m| m.exposure_time.is_none());
+        let relative = self.asked.values.is_some() || self.asked.times.is_none() && metadata.iter().any(|m| m.exposure_time.is_none());
         let linear = matches!(&stated, Some((_, Response::Linear)));
         if linear && let Some(word) = args.response.as_deref().filter(|w| *w != "linear") {
             return Err(Usage(format!("--response {word}: the frames are linear already; leave --response out")).into());
@@ -189,7 +185,7 @@ impl Job<'_> {
         if let Some(what) = by_file {
             origin["origin"] = json!(format!("stated by the files: {what}"));
         }
-        if args.frames.len() == self.settings.exclude.len() + 1 {
+        if args.frames.len() == self.asked.settings.exclude.len() + 1 {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
@@ -198,10 +194,10 @@ impl Job<'_> {
 
     /// The settings for frames of full size.
     pub fn settings(&self, opened: &Opened) -> anyhow::Result<Settings> {
-        let mut settings = self.settings.clone();
+        let mut settings = self.asked.settings.clone();
         if settings.focal_px.is_none() {
             let (w, h) = opened.bracket.size();
-            settings.focal_px = frames::focal_px(&self.args.frames[0], w, h)?;
+            settings.focal_px = frames::focal_px(&self.asked.args.frames[0], w, h)?;
         }
         settings.noise = settings.noise.or(opened.noise);
         Ok(settings)
@@ -217,7 +213,7 @@ impl Job<'_> {
         warnings: &[String],
         events: &mut dyn FnMut(Event) -> bool,
     ) -> anyhow::Result<String> {
-        let (args, photo) = (self.args, &self.photo);
+        let (args, photo) = (self.asked.args, &self.photo);
         events(Event::Progress { stage: "writing".into(), fraction: 1.0 });
         let reference = &bracket.frames()[outcome.reference];
         let noted = &opened.metadata[outcome.reference];
@@ -244,7 +240,7 @@ impl Job<'_> {
         }
         let mut outcome = std::borrow::Cow::Borrowed(outcome);
         if targets.page.is_some() || targets.report.is_some() {
-            let noise_origin = match (self.settings.noise, opened.noise) {
+            let noise_origin = match (self.asked.settings.noise, opened.noise) {
                 (Some(_), _) => "given",
                 (None, Some(_)) => "noted by the files",
                 (None, None) => "estimated from the frames",
@@ -294,7 +290,7 @@ impl Job<'_> {
                     display: &display,
                     to_display: colour::product(&colour::inverse(&Primaries::Rec709.to_xyz()).expect("standard primaries"), own),
                     warnings,
-                    divisor: self.divisor,
+                    divisor: self.asked.divisor,
                     settings: photo.listing(args),
                 };
                 staged.push(target.stage_text(&page.html())?);

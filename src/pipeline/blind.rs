@@ -332,10 +332,11 @@ impl Run<'_> {
         mask::masks(frames, &alone, self.settings.alpha as f32, &self.motions)
     }
 
-    /// Lessens the masks of the frames with less fine structure, for a merge of blurred frames. `detail`: 0..=1 per frame.
+    /// Lessens the masks of the frames with less fine structure, for a merge of blurred frames, by the square of `detail` (0..=1 per frame): a long
+    /// frame has so little noise that it would count most all the same.
     pub(super) fn prefer_detail(&mut self, detail: impl Fn(usize) -> f64) {
         for (i, mask) in self.masks.iter_mut().enumerate() {
-            let share = detail(i).clamp(LEAST_DETAIL, 1.0) as f32;
+            let share = detail(i).powi(2).clamp(LEAST_DETAIL, 1.0) as f32;
             mask.data.iter_mut().for_each(|m| *m *= share);
         }
     }

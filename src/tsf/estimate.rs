@@ -255,19 +255,21 @@ const LINK: f64 = 3.0;
 /// on its extent.
 fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
     let held = HeldOut::of(rows, frame.size());
-    let fitted = |evidence: &Evidence, (sparsity, connected): (f64, bool)| {
-        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * evidence.misfit(tsf).sqrt())?;
+    let fitted = |evidence: &Evidence, noise: f64, (sparsity, connected): (f64, bool)| {
+        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * noise)?;
         if connected { main_path(&found, chart) } else { Some(found) }
     };
     let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
+    let noise = inside.misfit(tsf).sqrt();
     let attempt = |&how: &(f64, bool)| {
-        let found = gathered(&fitted(&inside, how)?, chart)?;
+        let found = gathered(&fitted(&inside, noise, how)?, chart)?;
         Some((how, held.blocks(&judge.residual(&inside.refine(&found, chart, 3)))))
     };
     let tried: Vec<_> = THINNED.iter().filter_map(attempt).collect();
     let best = tried.iter().min_by(|a, b| Worse::than(&a.1, &b.1).by.total_cmp(&0.0));
     let sparsest = best.and_then(|best| tried.iter().rev().find(|t| Worse::than(&t.1, &best.1).forgivable()));
-    sparsest.and_then(|t| fitted(&Evidence::new(frame, rows), t.0)).unwrap_or_else(|| tsf.clone())
+    let all = Evidence::new(frame, rows);
+    sparsest.and_then(|t| fitted(&all, all.misfit(tsf).sqrt(), t.0)).unwrap_or_else(|| tsf.clone())
 }
 
 /// The poses of `tsf` that hang together and weigh most.

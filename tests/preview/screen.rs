@@ -1,4 +1,5 @@
 use super::support::{Times, frames};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 /// A virtual screen, which ends with this.
@@ -23,6 +24,14 @@ impl Screen {
     }
 }
 
+/// The program's window on `screen`, which saves its picture and closes.
+fn preview(screen: &Screen, folder: &Path, picture: &Path) -> Command {
+    let mut program = Command::new(env!("CARGO_BIN_EXE_unshaken"));
+    program.args(["preview", "--size", "1000x700", "--theme", "dark", "--screenshot"]).arg(picture).args(frames(folder, Times::Exif));
+    program.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").env("XDG_STATE_HOME", folder);
+    program
+}
+
 impl Drop for Screen {
     fn drop(&mut self) {
         let _ = self.server.kill();
@@ -33,13 +42,8 @@ impl Drop for Screen {
 #[test]
 fn a_real_window_shows_the_loaded_result_and_saves_its_picture() {
     let folder = tempfile::tempdir().unwrap();
-    let files = frames(folder.path(), Times::Exif);
-    let screen = Screen::open();
-    let picture = folder.path().join("window.png");
-    let mut program = Command::new(env!("CARGO_BIN_EXE_unshaken"));
-    program.args(["preview", "--size", "1000x700", "--theme", "dark", "--screenshot"]).arg(&picture).args(&files);
-    program.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").env("XDG_STATE_HOME", folder.path());
-    let run = program.output().unwrap();
+    let (screen, picture) = (Screen::open(), folder.path().join("window.png"));
+    let run = preview(&screen, folder.path(), &picture).output().unwrap();
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
     let shown = image::open(&picture).unwrap().into_rgb8();
     assert_eq!((shown.width(), shown.height()), (1000, 700));
@@ -48,7 +52,7 @@ fn a_real_window_shows_the_loaded_result_and_saves_its_picture() {
     let colours: std::collections::BTreeSet<[u8; 3]> = middle.pixels().map(|p| p.0).collect();
     assert!(colours.len() > 500, "{} colours", colours.len());
     if let Some(folder) = std::env::var_os("UNSHAKEN_PICTURES") {
-        std::fs::copy(&picture, std::path::Path::new(&folder).join("screen.png")).unwrap();
+        std::fs::copy(&picture, Path::new(&folder).join("screen.png")).unwrap();
     }
 }
 
@@ -58,13 +62,8 @@ fn a_window_that_is_resized_while_it_solves_stays_open() {
     use x11rb::connection::Connection;
     use x11rb::protocol::xproto::{ConfigureWindowAux, ConnectionExt, MapState, Window};
     let folder = tempfile::tempdir().unwrap();
-    let files = frames(folder.path(), Times::Exif);
-    let screen = Screen::open();
-    let picture = folder.path().join("window.png");
-    let mut program = Command::new(env!("CARGO_BIN_EXE_unshaken"));
-    program.args(["preview", "--size", "1000x700", "--screenshot"]).arg(&picture).args(&files);
-    program.env("DISPLAY", &screen.name).env_remove("WAYLAND_DISPLAY").env("XDG_STATE_HOME", folder.path());
-    let mut run = program.stderr(Stdio::piped()).spawn().unwrap();
+    let (screen, picture) = (Screen::open(), folder.path().join("window.png"));
+    let mut run = preview(&screen, folder.path(), &picture).stderr(Stdio::piped()).spawn().unwrap();
 
     let (x, number) = x11rb::connect(Some(&screen.name)).unwrap();
     let root = x.setup().roots[number].root;

@@ -276,11 +276,7 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     window.harness.run_steps(3);
     window.picture();
     click(&mut window, "Write the files");
-    let end = Instant::now() + Duration::from_secs(30);
-    while !target.exists() && Instant::now() < end {
-        std::thread::sleep(Duration::from_millis(30));
-        window.harness.step();
-    }
+    window.wait("the files", 30, |_| target.exists());
     assert!(target.exists() && target.with_extension("png").exists() && target.with_extension("json").exists());
     // The same as TIFF, with a page.
     let tiff = folder.path().join("seen.tif");
@@ -292,11 +288,7 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
         click(&mut window, label);
     }
     let page = tiff.with_extension("html");
-    let end = Instant::now() + Duration::from_secs(30);
-    while !page.exists() && Instant::now() < end {
-        std::thread::sleep(Duration::from_millis(30));
-        window.harness.step();
-    }
+    window.wait("the page", 30, |_| page.exists());
     assert!(std::fs::read_to_string(&page).unwrap().contains("<html"));
     let read = unshaken::io::input::read(&tiff, 1.0).unwrap().intensity;
     for (a, b) in read.0.iter().zip(pixels(&target)) {
@@ -439,12 +431,7 @@ fn a_device_that_is_lost_is_opened_anew_with_the_session() {
     // While the solver works on it.
     window.render.device.destroy();
     let kept = window.kept.clone();
-    let end = Instant::now() + Duration::from_secs(30);
-    while !kept.lock().unwrap().again {
-        assert!(Instant::now() < end, "the window does not ask to be opened again");
-        window.harness.step();
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    window.wait("the wish to be opened again", 30, |_| kept.lock().unwrap().again);
     drop(window);
     let mut window = Window::with(&Options::default(), kept, 1.0);
     window.harness.run_steps(2);

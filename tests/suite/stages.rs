@@ -20,19 +20,22 @@ fn planted(poses: &[(f64, f64, f64, f64)]) -> Tsf {
     Tsf::new(1.2 * SIZE.0 as f64, poses.iter().map(|p| Pose::planar(p.0, p.1, p.2, p.3)).collect()).unwrap()
 }
 
+/// `count` sums of twelve uniforms of variance 1/3: standard normal times 2.
+fn twelve(seed: u64, count: usize) -> Vec<f32> {
+    (0..12).map(|k| numbers(seed + k, count)).fold(vec![0.0; count], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect())
+}
+
 #[test]
 fn the_noise_level_is_found_within_a_fifth() {
     // Flat fields with shot and read noise beside hard texture, which must not pass for noise.
     for (full_well, read_noise) in [(2000.0, 6.0), (8000.0, 5.0), (30000.0, 12.0)] {
         let truth = noise::NoiseModel::from_electrons(full_well, read_noise);
         let (w, h) = (256, 256);
-        let n: Vec<f32> =
-            (0..12).map(|k| numbers(100 + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
+        let n = twelve(100, w * h);
         let value = |x: usize, y: usize| {
             let level = 0.01 + 0.8 * ((x / 16) as f64 / 16.0).powi(2);
             if (y / 64) % 2 == 1 { level * if (x + y).is_multiple_of(2) { 0.8 } else { 1.1 } } else { level }
         };
-        // Sum of twelve uniforms of variance 1/3: standard normal times 2.
         let plane = Plane::from_fn(w, h, |x, y| {
             let e = value(x, y);
             let z = e + truth.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0;
@@ -55,8 +58,7 @@ fn texture_that_two_frames_share_is_no_noise() {
     let (w, h) = (256, 192);
     let grain = numbers(7, w * h);
     let frame = |exposure_time: f64, seed: u64| {
-        let n: Vec<f32> =
-            (0..12).map(|k| numbers(seed + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
+        let n = twelve(seed, w * h);
         let plane = Plane::from_fn(w, h, |x, y| {
             let level = 0.02 + 0.5 * ((x / 16) as f64 / 16.0).powi(2);
             let e = exposure_time * level * (1.0 + 0.3 * f64::from(grain[y * w + x]));
@@ -204,8 +206,7 @@ fn a_frame_that_none_can_be_compared_with_is_not_taken_for_sharp() {
     let grain = numbers(3, w * h);
     let light = |x: usize, y: usize| (1.0 + 0.4 * f64::from(grain[y * w + x])) * if x < w / 2 { 1.0 } else { 5e-4 };
     let frame = |exposure_time: f64, seed: u64| {
-        let n: Vec<f32> =
-            (0..12).map(|k| numbers(seed + k, w * h)).fold(vec![0.0; w * h], |s, v| s.iter().zip(&v).map(|(a, b)| a + b).collect());
+        let n = twelve(seed, w * h);
         let plane = Plane::from_fn(w, h, |x, y| {
             let e = exposure_time * light(x, y);
             (e + level.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0).clamp(0.0, 1.0) as f32
