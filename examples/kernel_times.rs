@@ -30,12 +30,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 taps.bases.len(),
                 taps.taps.len()
             );
-            let blur = Blur::new(&gpu, kernels.blur(&gpu, interpolation), &taps, size, pad);
-            let scratch = Scratch::new(&gpu, blur.scratch_wanted())?;
+            let blur = Blur::new(&gpu, kernels.blur(interpolation), &taps, size, pad);
+            let scratch = Scratch::new(&gpu, blur.scratch_wanted(), 3)?;
             let latent = channels(&gpu, "latent", (size.0 + 2 * pad) * (size.1 + 2 * pad))?;
             let frame = channels(&gpu, "frame", size.0 * size.1)?;
-            let forward = blur.forward(&gpu, kernels.blur(&gpu, interpolation), &scratch, &latent, &frame);
-            let adjoint = blur.adjoint(&gpu, kernels.blur(&gpu, interpolation), &scratch, &frame, &latent, 1.0);
+            let forward = blur.forward(&gpu, kernels.blur(interpolation), &scratch, &latent, &frame);
+            let adjoint = blur.adjoint(&gpu, kernels.blur(interpolation), &scratch, &frame, &latent, 1.0);
             for (name, steps) in [("K", forward), ("Kᵀ", adjoint)] {
                 for (i, step) in steps.iter().enumerate() {
                     gpu.submit(std::slice::from_ref(step));

@@ -2,7 +2,8 @@
 struct Params {
     count: u32,
     row: u32,
-    _pad: vec2u,
+    scalars: u32,   // first scalar of the channel
+    _pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -14,7 +15,8 @@ struct Params {
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
     let i = (group.y * params.row + group.x) * 128u + local;
-    let beta = select(0.0, scalars[0] / scalars[2], scalars[2] > 0.0);
+    let before = scalars[params.scalars + 2u];
+    let beta = select(0.0, scalars[params.scalars] / before, before > 0.0);
     if i < params.count {
         direction[i] = residual[i] / diagonal[i] + beta * direction[i];
     }

@@ -4,7 +4,7 @@ struct Params {
     count: u32,
     partial: u32,
     row: u32,
-    _pad: u32,
+    scalars: u32,   // first scalar of the channel
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -23,7 +23,9 @@ fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) grou
     let g = group.y * params.row + group.x;
     let i = g * 128u + local;
     // A search direction without curvature has nothing left to find: alpha 0 ends the iteration in place.
-    let alpha = select(0.0, scalars[0] / scalars[1], scalars[1] > 0.0);
+    let energy = scalars[params.scalars];
+    let curvature = scalars[params.scalars + 1u];
+    let alpha = select(0.0, energy / curvature, curvature > 0.0);
     var term = 0.0;
     if i < params.count {
         solution[i] += alpha * direction[i];

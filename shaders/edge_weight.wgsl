@@ -1,34 +1,37 @@
-// Half-quadratic weights of total variation on log irradiance u, shared by the channels so that edges keep their colour:
+// Half-quadratic weights of total variation on log irradiance u = ln E, shared by the channels so that edges keep their colour:
 // w = lambda / sqrt(sum_c |D u_c|^2 + epsilon^2), with forward differences D that are zero across the border; and the
 // smoothness term lambda sum (sqrt(...) - epsilon) of eq. (9) as one partial sum per workgroup.
 struct Params {
     size: vec2i,
+    rows: vec2i,     // the first to compute, and the one after the last
+    first: i32,      // row that comes first in the bindings
+    partial: u32,    // first partial sum
+    row: u32,        // workgroups per row
     lambda: f32,
     epsilon: f32,
-    partial: u32,
-    row: u32,        // workgroups per row
+    _pad: f32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> log_r: array<f32>;
-@group(0) @binding(2) var<storage, read> log_g: array<f32>;
-@group(0) @binding(3) var<storage, read> log_b: array<f32>;
+@group(0) @binding(1) var<storage, read> irradiance_r: array<f32>;
+@group(0) @binding(2) var<storage, read> irradiance_g: array<f32>;
+@group(0) @binding(3) var<storage, read> irradiance_b: array<f32>;
 @group(0) @binding(4) var<storage, read_write> edge: array<f32>;
 @group(0) @binding(5) var<storage, read_write> partials: array<f32>;
 
 var<workgroup> shared_sum: array<f32, 128>;
 
 fn squared_difference(i: u32, k: u32) -> f32 {
-    let d = vec3f(log_r[k] - log_r[i], log_g[k] - log_g[i], log_b[k] - log_b[i]);
+    let d = log(vec3f(irradiance_r[k] / irradiance_r[i], irradiance_g[k] / irradiance_g[i], irradiance_b[k] / irradiance_b[i]));
     return dot(d, d);
 }
 
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u, @builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let p = vec2i(id.xy);
+    let p = vec2i(id.xy) + vec2i(0, params.rows.x);
     var term = 0.0;
-    if all(p < params.size) {
-        let i = at(p, params.size.x);
+    if p.x < params.size.x && p.y < params.rows.y {
+        let i = at(p - vec2i(0, params.first), params.size.x);
         var squared = params.epsilon * params.epsilon;
         if p.x + 1 < params.size.x {
             squared += squared_difference(i, i + 1u);

@@ -1,54 +1,42 @@
 // Squared residual over variance, mean of the three channels, and how many pixels it stands for, of one frame: the first
-// step of the residual-driven weights.
+// step of the residual-driven weights. One channel at a time adds its third.
 struct Params {
     size: vec2i,             // of the frame
+    rows: vec2i,             // of the frame: the first to compute, and the one after the last
     predicted_offset: vec2i, // of frame pixel (0, 0) in the prediction
     predicted_stride: i32,
+    predicted_first: i32,    // row of the prediction that comes first in its binding
+    first: i32,              // row of the frame that comes first in the other bindings
     exposure_time: f32,      // s
     black_clipped: u32,
-    _pad: u32,
-    noise: array<vec4f, 192>,  // as in weights.wgsl, for red, green, blue
+    accumulate: u32,         // 0: the first channel
+    noise: array<vec4f, 64>, // as in weights.wgsl
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> predicted_r: array<f32>;
-@group(0) @binding(2) var<storage, read> predicted_g: array<f32>;
-@group(0) @binding(3) var<storage, read> predicted_b: array<f32>;
-@group(0) @binding(4) var<storage, read> exposure_r: array<f32>;
-@group(0) @binding(5) var<storage, read> exposure_g: array<f32>;
-@group(0) @binding(6) var<storage, read> exposure_b: array<f32>;
-@group(0) @binding(7) var<storage, read> mask: array<f32>;
-@group(0) @binding(8) var<storage, read_write> misfit: array<vec2f>;
+@group(0) @binding(1) var<storage, read> predicted: array<f32>;  // K E, irradiance
+@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white
+@group(0) @binding(3) var<storage, read> mask: array<f32>;
+@group(0) @binding(4) var<storage, read_write> misfit: array<f32>;
+@group(0) @binding(5) var<storage, read_write> counted: array<f32>;
 
-fn noise_of(channel: u32, exposure: f32) -> f32 {
-    let s = sqrt(clamp(exposure, 0.0, 1.0)) * 255.0;
-    let i = min(u32(s), 254u);
-    let k = channel * 256u + i;
-    let a = params.noise[k / 4u][k % 4u];
-    let b = params.noise[(k + 1u) / 4u][(k + 1u) % 4u];
-    return mix(a, b, s - f32(i));
-}
-
-fn chi_squared(channel: u32, predicted: f32, exposure: f32) -> f32 {
-    let expected = max(predicted, 0.0) * params.exposure_time;
-    let s = noise_of(channel, expected);
+@compute @workgroup_size(16, 8)
+fn main(@builtin(global_invocation_id) id: vec3u) {
+    let p = vec2i(id.xy) + vec2i(0, params.rows.x);
+    if p.x >= params.size.x || p.y >= params.rows.y {
+        return;
+    }
+    let i = at(p - vec2i(0, params.first), params.size.x);
+    let k = at(p + params.predicted_offset - vec2i(0, params.predicted_first), params.predicted_stride);
+    let expected = max(predicted[k], 0.0) * params.exposure_time;
+    let s = noise_of(expected);
     var m = Moments(expected, 1.0, s * s);
     if params.black_clipped == 1u {
         m = clipped_at_black(expected, s);
     }
-    let r = exposure - m.mean;
-    return r * r / m.variance;
-}
-
-@compute @workgroup_size(16, 8)
-fn main(@builtin(global_invocation_id) id: vec3u) {
-    let p = vec2i(id.xy);
-    if any(p >= params.size) {
-        return;
-    }
-    let i = at(p, params.size.x);
-    let k = at(p + params.predicted_offset, params.predicted_stride);
-    let chi = chi_squared(0u, predicted_r[k], exposure_r[i]) + chi_squared(1u, predicted_g[k], exposure_g[i])
-        + chi_squared(2u, predicted_b[k], exposure_b[i]);
-    misfit[i] = select(vec2f(0.0), vec2f(chi / 3.0, 1.0), mask[i] > 0.0);
+    let r = exposure[i] - m.mean;
+    let before = select(0.0, misfit[i], params.accumulate == 1u);
+    let counts = mask[i] > 0.0;
+    misfit[i] = select(0.0, before + r * r / m.variance / 3.0, counts);
+    counted[i] = select(0.0, 1.0, counts);
 }

@@ -2,8 +2,11 @@
 // eq. (9) in log irradiance), for one channel; `back` holds K^T W K diag(E) x. Also <x, q> as one partial sum per workgroup.
 struct Params {
     size: vec2i,
-    partial: u32,
+    rows: vec2i,    // the first to compute, and the one after the last
+    first: i32,     // row that comes first in the bindings
+    partial: u32,   // first partial sum
     row: u32,       // workgroups per row
+    _pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -22,11 +25,11 @@ fn value(i: u32) -> f32 {
 
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u, @builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let p = vec2i(id.xy);
+    let p = vec2i(id.xy) + vec2i(0, params.rows.x);
     var term = 0.0;
-    if all(p < params.size) {
-        let i = at(p, params.size.x);
-        let q = irradiance[i] * back[i] + smoothness(p, params.size);
+    if p.x < params.size.x && p.y < params.rows.y {
+        let i = at(p - vec2i(0, params.first), params.size.x);
+        let q = irradiance[i] * back[i] + smoothness(p, i, params.size);
         product[i] = q;
         term = direction[i] * q;
     }

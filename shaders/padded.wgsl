@@ -1,5 +1,7 @@
 // A part of an image with a margin of zeros: what lies outside the image reads as 0, so that the kernels that read the copy need no
-// check of the border. (Software rasterisers run both sides of every branch.) Three channels.
+// check of the border. (Software rasterisers run both sides of every branch.)
+// Channels that the operator works on at a time: 3, or only the first. What is not written is not read either.
+override CHANNELS: u32 = 3u;
 struct Params {
     in_size: vec2i,    // of the image
     out_size: vec2i,
@@ -30,6 +32,8 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     }
     let i = at(o, params.out_size.x);
     out_r[i] = v.x;
-    out_g[i] = v.y;
-    out_b[i] = v.z;
+    if CHANNELS > 1u {
+        out_g[i] = v.y;
+        out_b[i] = v.z;
+    }
 }

@@ -1,4 +1,4 @@
-// The translations of the blur, eq. (4): out(p) = sum over taps of weight * in(p - shift), three channels at once. A fractional
+// The translations of the blur, eq. (4): out(p) = sum over taps of weight * in(p - shift), all channels at once. A fractional
 // translation is its interpolation kernel splatted on integer shifts, so any number of poses costs as many taps as the camera's path is
 // pixels long. Forward: `in` holds the planes of the base warps and one invocation sums them all. Adjoint: mirrored shifts, `in` is the
 // frame, one group (invocation z) per base.
@@ -12,6 +12,8 @@
 // `place` is the index of the run's first load for output pixel (0, 0); the k-th shift reads k values further.
 // Whether to add to what the output holds: no parameter, because software rasterisers run both sides of a branch.
 override ACCUMULATE: bool = false;
+// Channels that the operator works on at a time: 3, or only the first. What is not written is not read either.
+override CHANNELS: u32 = 3u;
 
 struct Params {
     out_size: vec2i,
@@ -102,12 +104,16 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         if p.x + c < params.out_size.x {
             if ACCUMULATE {
                 out_r[o + c] += red[c / 4][c % 4];
-                out_g[o + c] += green[c / 4][c % 4];
-                out_b[o + c] += blue[c / 4][c % 4];
+                if CHANNELS > 1u {
+                    out_g[o + c] += green[c / 4][c % 4];
+                    out_b[o + c] += blue[c / 4][c % 4];
+                }
             } else {
                 out_r[o + c] = red[c / 4][c % 4];
-                out_g[o + c] = green[c / 4][c % 4];
-                out_b[o + c] = blue[c / 4][c % 4];
+                if CHANNELS > 1u {
+                    out_g[o + c] = green[c / 4][c % 4];
+                    out_b[o + c] = blue[c / 4][c % 4];
+                }
             }
         }
     }

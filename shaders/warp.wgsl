@@ -1,9 +1,11 @@
-// Warps of eq. (4): out(q) = sum over bases b of weight_b E(H_b^-1 q). Three channels at once because they share the interpolation
+// Warps of eq. (4): out(q) = sum over bases b of weight_b E(H_b^-1 q). Channels together because they share the interpolation
 // weights; four pixels of a row per invocation. Rotate-then-shift: one base per plane of the output (invocation z), weight 1. Direct:
 // all poses into the frame. E is a copy with a margin of zeros (padded.wgsl): positions beyond are clamped into the margin.
 override SUPPORT: i32 = 2;
 // Whether to add to what the output holds: no parameter, because software rasterisers run both sides of a branch.
 override ACCUMULATE: bool = false;
+// Channels that the operator works on at a time: 3, or only the first. What is not written is not read either.
+override CHANNELS: u32 = 3u;
 
 struct Params {
     in_size: vec2i,        // of the copy
@@ -69,12 +71,16 @@ fn source(abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
 fn store(i: u32, value: vec3f) {
     if ACCUMULATE {
         out_r[i] += value.x;
-        out_g[i] += value.y;
-        out_b[i] += value.z;
+        if CHANNELS > 1u {
+            out_g[i] += value.y;
+            out_b[i] += value.z;
+        }
     } else {
         out_r[i] = value.x;
-        out_g[i] = value.y;
-        out_b[i] = value.z;
+        if CHANNELS > 1u {
+            out_g[i] = value.y;
+            out_b[i] = value.z;
+        }
     }
 }
 

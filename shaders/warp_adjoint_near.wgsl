@@ -41,8 +41,10 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         // Each pixel has its own guard: an overrun would write into the next row.
         if p.x + k < params.size.x {
             latent_r[o + u32(k)] += params.factor * red[k];
-            latent_g[o + u32(k)] += params.factor * green[k];
-            latent_b[o + u32(k)] += params.factor * blue[k];
+            if CHANNELS > 1u {
+                latent_g[o + u32(k)] += params.factor * green[k];
+                latent_b[o + u32(k)] += params.factor * blue[k];
+            }
         }
     }
 }

@@ -60,13 +60,13 @@ impl Device {
     fn new(taps: &TapSet, image: &[Vec<f32>; 3]) -> Self {
         let gpu = Gpu::new().expect("an adapter");
         let kernels = Kernels::new(&gpu);
-        let blur = Blur::new(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), taps, (SIDE, SIDE), 0);
-        let scratch = Scratch::new(&gpu, blur.scratch_wanted()).expect("memory");
+        let blur = Blur::new(&gpu, kernels.blur(Interpolation::Bilinear), taps, (SIDE, SIDE), 0);
+        let scratch = Scratch::new(&gpu, blur.scratch_wanted(), 3).expect("memory");
         let latent = image.each_ref().map(|c| gpu.upload("latent", c).expect("memory"));
         let frame = channels(&gpu, "frame", SIDE * SIDE).expect("memory");
         let back = channels(&gpu, "back", SIDE * SIDE).expect("memory");
-        let forward = blur.forward(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &latent, &frame);
-        let adjoint = blur.adjoint(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &latent, &back, 1.0);
+        let forward = blur.forward(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &latent, &frame);
+        let adjoint = blur.adjoint(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &latent, &back, 1.0);
         Self { gpu, frame, back, forward, adjoint }
     }
 

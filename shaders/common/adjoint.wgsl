@@ -1,5 +1,7 @@
 // Parameters and bindings of the adjoints of the warps.
 override SUPPORT: i32 = 2;
+// Channels that the operator works on at a time: 3, or only the first. What is not written is not read either.
+override CHANNELS: u32 = 3u;
 
 struct Params {
     size: vec2i,       // of the latent grid

@@ -1,4 +1,14 @@
-// Noise of one observation: mean and variance of an intensity that is clipped at black. No bindings, no entry points.
+// Noise of one observation: mean and variance of an intensity that is clipped at black. No bindings, no entry points; the including
+// kernel declares `params.noise`.
+
+// Standard deviation at an exposure.
+fn noise_of(exposure: f32) -> f32 {
+    let s = sqrt(clamp(exposure, 0.0, 1.0)) * 255.0;
+    let i = min(u32(s), 254u);
+    let a = params.noise[i / 4u][i % 4u];
+    let b = params.noise[(i + 1u) / 4u][(i + 1u) % 4u];
+    return mix(a, b, s - f32(i));
+}
 
 // Standard normal density and distribution function (Abramowitz & Stegun 7.1.26, error below 1.5e-7).
 fn normal_density(t: f32) -> f32 {

@@ -1,7 +1,6 @@
-// D^T w D x at pixel p for forward differences D that are zero across the border. No bindings, no entry points; the
-// including kernel declares `edge` (w) and the pointer-free accessor `value(i)` of x.
-fn smoothness(p: vec2i, size: vec2i) -> f32 {
-    let i = at(p, size.x);
+// D^T w D x at pixel p, which is value i of the bindings, for forward differences D that are zero across the border. No bindings, no
+// entry points; the including kernel declares `edge` (w) and the pointer-free accessor `value(i)` of x.
+fn smoothness(p: vec2i, i: u32, size: vec2i) -> f32 {
     let row = u32(size.x);
     let here = value(i);
     var sum = 0.0;
@@ -13,8 +12,7 @@ fn smoothness(p: vec2i, size: vec2i) -> f32 {
 }
 
 // Diagonal of D^T w D.
-fn smoothness_diagonal(p: vec2i, size: vec2i) -> f32 {
-    let i = at(p, size.x);
+fn smoothness_diagonal(p: vec2i, i: u32, size: vec2i) -> f32 {
     var sum = 0.0;
     if p.x + 1 < size.x { sum += edge[i]; }
     if p.y + 1 < size.y { sum += edge[i]; }

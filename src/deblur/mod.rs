@@ -27,12 +27,13 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, Channels, Kernels, MisfitSource, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, STILL, Scratch, ScratchSize,
-    WeightTarget, channels, partials_1d, partials_2d,
+    Blur, Channels, HALO, Kernels, Misfit, MisfitSource, REACH, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS,
+    STILL, Scratch, ScratchSize, WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use memory::{Need, Plan};
 use serde::Serialize;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// One frame as the solver sees it.
@@ -183,6 +184,8 @@ pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usiz
 /// Part of the strength of the residual-driven weights that a displaced sharp frame gets: what its samples between the grid's pixels differ
 /// by is no wrong TSF, and it is the best frame there is on its own pixels.
 const STILL_ROBUST: f32 = 0.3;
+/// Least irradiance: the logarithm needs one above 0.
+const DARKEST: f32 = 1e-30;
 /// Part of the time that the iteration takes.
 const ITERATING: f32 = 0.95;
 /// Displacement in pixels from which a frame counts as displaced rather than shaken.
@@ -206,53 +209,48 @@ struct Moving {
 
 impl Moving {
     /// Steps of `frame = K latent`.
-    fn forward(&self, solver: &Solver, latent: &Channels, frame: &Channels) -> Vec<Step> {
-        let compiled = solver.kernels.blur(solver.gpu, self.operator.interpolation);
-        self.operator.blur.forward(solver.gpu, compiled, &solver.state.scratch, latent, frame)
+    fn forward(&self, solver: &Solver, latent: &[wgpu::Buffer], frame: &[wgpu::Buffer]) -> Vec<Step> {
+        let kernels = solver.kernels.blur(self.operator.interpolation);
+        self.operator.blur.forward(solver.gpu, kernels, &solver.state.scratch, latent, frame)
     }
 
     /// Steps of `latent += factor Kᵀ frame`.
-    fn adjoint(&self, solver: &Solver, frame: &Channels, latent: &Channels, factor: f32) -> Vec<Step> {
-        let compiled = solver.kernels.blur(solver.gpu, self.operator.interpolation);
-        self.operator.blur.adjoint(solver.gpu, compiled, &solver.state.scratch, frame, latent, factor)
+    fn adjoint(&self, solver: &Solver, frame: &[wgpu::Buffer], latent: &[wgpu::Buffer], factor: f32) -> Vec<Step> {
+        let kernels = solver.kernels.blur(self.operator.interpolation);
+        self.operator.blur.adjoint(solver.gpu, kernels, &solver.state.scratch, frame, latent, factor)
     }
+}
+
+/// Exposure and mask of a frame.
+enum Kept {
+    /// In buffers of their own.
+    Device { exposure: Channels, mask: wgpu::Buffer },
+    /// On the host, to fill buffers that are shared before they are read: red, green, blue, mask.
+    Host([Arc<Vec<f32>>; 4]),
 }
 
 struct Observed {
-    exposure: Channels,
-    mask: wgpu::Buffer,
-    misfit: wgpu::Buffer,
+    kept: Kept,
     moving: Option<Moving>,
-    /// Exposure and mask, when their buffers are shared and have to be filled before use.
-    host: Option<[Arc<Vec<f32>>; 4]>,
-}
-
-impl Observed {
-    /// Steps after which exposure and mask are on the device.
-    fn uploads(&self) -> Vec<Step> {
-        let to = self.exposure.iter().chain(std::iter::once(&self.mask));
-        self.host.iter().flatten().zip(to).map(|(values, buffer)| Step::Upload(values.clone(), buffer.clone())).collect()
-    }
 }
 
 struct State {
     irradiance: Channels,
-    log: Channels,
+    /// Before the step that is tried.
     old: Channels,
     solution: Channels,
-    residual: Channels,
-    direction: Channels,
-    product: Channels,
-    scaled: Channels,
-    back: Channels,
-    diagonal: Channels,
-    data_diagonal: Channels,
     weight: Channels,
     observation: Channels,
     edge: wgpu::Buffer,
-    predicted: Channels,
-    frame: Channels,
-    misfit_scratch: wgpu::Buffer,
+    /// Of the channels that are solved together: one, or three.
+    residual: Vec<wgpu::Buffer>,
+    direction: Vec<wgpu::Buffer>,
+    product: Vec<wgpu::Buffer>,
+    back: Vec<wgpu::Buffer>,
+    diagonal: Vec<wgpu::Buffer>,
+    predicted: Vec<wgpu::Buffer>,
+    misfit: Misfit,
+    misfit_scratch: Misfit,
     partials: wgpu::Buffer,
     scalars: wgpu::Buffer,
     scratch: Scratch,
@@ -291,6 +289,67 @@ fn check(observations: &[Observation], initial: &Rgb) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// The operators of a bracket and what they and the iteration keep.
+struct Layout {
+    frame: (usize, usize),
+    /// None for a frame in place.
+    operators: Vec<Option<Operator>>,
+    need: Need,
+}
+
+impl Layout {
+    fn new(gpu: &Gpu, kernels: &Kernels, tsfs: &[&Tsf], latent: (usize, usize), pad: usize, interpolation: Interpolation) -> Result<Self> {
+        let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
+        let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
+        let operator = |tsf: &Tsf| {
+            let still = tsf.single().is_some();
+            let interpolation = if still { STILL } else { interpolation };
+            let taps = TapSet::new(tsf, frame.0, frame.1, interpolation);
+            let blur = Blur::new(gpu, kernels.blur(interpolation), &taps, frame, pad);
+            Operator { blur, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
+        };
+        let operators: Vec<Option<Operator>> = tsfs.iter().map(|t| (!t.is_identity()).then(|| operator(t))).collect();
+        let blurs = || operators.iter().flatten().map(|o| &o.blur);
+        let rows = blurs().map(Blur::rows_at_once).fold(1 + 2 * HALO.max(REACH), usize::max);
+        if !gpu.rows_fit(rows, latent) {
+            return Err(Error::Adapter(format!(
+                "frames of {} x {} pixels: {} allows {} KiB per binding, less than {rows} of their rows need; reduce them with --scale, \
+                 or use another adapter",
+                frame.0,
+                frame.1,
+                gpu.description,
+                gpu.max_binding() >> 8
+            )));
+        }
+        let scratch = |size: fn(&Blur) -> ScratchSize| blurs().map(size).fold(ScratchSize::default(), ScratchSize::max);
+        let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
+        // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
+        let most = (1 << 25).min(gpu.max_binding());
+        let shaken = blurs().count();
+        let need = Need {
+            latent: n,
+            frame: m,
+            frames: tsfs.len(),
+            shaken,
+            partials: (partials_1d(gpu, n) + shaken * partials_1d(gpu, m)).max(partials_2d(gpu, latent)),
+            scratch_wanted: wanted.min(ScratchSize { planes: most, copy: most }.max(needed)),
+            scratch_needed: needed,
+        };
+        Ok(Self { frame, operators, need })
+    }
+}
+
+/// Device memory of a solve of frames of `frame` = (width, height) pixels under `tsfs`, with a latent grid that surrounds them by `pad`.
+///
+/// # Errors
+/// [`Error::OutOfMemory`], with what it needs at least, when that is beyond [`Settings::memory_limit`]; [`Error::Adapter`] when the rows are too
+/// long for the adapter.
+pub fn memory(gpu: &Gpu, kernels: &Kernels, tsfs: &[&Tsf], frame: (usize, usize), pad: usize, settings: &Settings) -> Result<Memory> {
+    let latent = (frame.0 + 2 * pad, frame.1 + 2 * pad);
+    let layout = Layout::new(gpu, kernels, tsfs, latent, pad, settings.interpolation)?;
+    Ok(layout.need.plan(settings.memory_limit.unwrap_or(u64::MAX))?.memory)
 }
 
 /// Irradiance that explains `observations`, from the start `initial` (irradiance, positive; grid of the frame plus `pad` on
@@ -357,97 +416,56 @@ impl<'a> Solver<'a> {
         gpu.start_count();
         let latent = initial.size();
         check(observations, initial)?;
-        let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
-        let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
-        let blurs: Vec<Option<Operator>> = observations
-            .iter()
-            .map(|o| {
-                (!o.tsf.is_identity()).then(|| {
-                    let still = o.tsf.single().is_some();
-                    let interpolation = if still { STILL } else { settings.interpolation };
-                    let taps = TapSet::new(&o.tsf, frame.0, frame.1, interpolation);
-                    let blur = Blur::new(gpu, kernels.blur(gpu, interpolation), &taps, frame, pad);
-                    Operator { blur, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
-                })
-            })
-            .collect();
-        let shaken = blurs.iter().flatten().count();
-        if n.max(2 * m) > gpu.max_binding() {
-            return Err(Error::Adapter(format!(
-                "frames of {} x {} pixels: {} allows {} MiB per binding, less than they need; reduce them with --scale, or use another adapter",
-                frame.0,
-                frame.1,
-                gpu.description,
-                gpu.max_binding() >> 18
-            )));
-        }
-        let scratch =
-            |size: fn(&Blur) -> ScratchSize| blurs.iter().flatten().map(|b| size(&b.blur)).fold(ScratchSize::default(), ScratchSize::max);
-        let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
-        // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let most = (1 << 25).min(gpu.max_binding());
-        let partials = 3 * (observations.len() + 1) * partials_1d(n).max(partials_2d(latent));
-        let need = Need {
-            latent: n,
-            frame: m,
-            frames: observations.len(),
-            shaken,
-            partials,
-            scratch_wanted: wanted.min(ScratchSize { planes: most, copy: most }.max(needed)),
-            scratch_needed: needed,
-        };
+        let tsfs: Vec<&Tsf> = observations.iter().map(|o| &o.tsf).collect();
+        let Layout { frame, operators, need } = Layout::new(gpu, kernels, &tsfs, latent, pad, settings.interpolation)?;
+        let (n, m, shaken) = (need.latent, need.frame, need.shaken);
         let Plan { memory, scratch } = need.plan(limit)?;
-        let scratch = Scratch::new(gpu, scratch)?;
-        let log = initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE).ln()));
+        let together = memory.channels_together;
+        let scratch = Scratch::new(gpu, scratch, together)?;
         let ch = |label, count| channels(gpu, label, count);
-        // Vectors that are never alive together share a buffer: see the order of the steps in `run`.
-        let (residual, scaled) = (ch("residual of the step", n)?, ch("scaled direction, product", n)?);
-        let (solution, direction, back) = (ch("step", n)?, ch("search direction", n)?, ch("back-projection", n)?);
-        let any_moving = shaken > 0;
+        let some = |label, count| (0..together).map(|_| gpu.plane(label, count)).collect::<Result<Vec<_>>>();
+        let (residual, direction, product) = (some("residual of the step", n)?, some("search direction", n)?, some("product", n)?);
+        let diagonal = some("preconditioner", n)?;
+        // Vectors that are never alive together share buffers: see the order of the steps in `run`.
+        let old = match together {
+            3 => std::array::from_fn(|c| residual[c].clone()),
+            _ => [&residual, &product, &diagonal].map(|v| v[0].clone()),
+        };
+        let misfit = |sum: &[wgpu::Buffer], counted: &[wgpu::Buffer]| Misfit { sum: sum[0].clone(), counted: counted[0].clone() };
         let state = State {
-            irradiance: upload_rgb(gpu, "irradiance", &initial.map_planes(|p| p.map(|v| v.max(f32::MIN_POSITIVE))))?,
-            log: upload_rgb(gpu, "log irradiance", &log)?,
-            // The log irradiance before the step is kept when the residual of the step is no longer needed.
-            old: residual.clone(),
-            solution,
-            residual,
-            // The product is written after the scaled direction was projected, the data diagonal read before there is one.
-            product: scaled.clone(),
-            data_diagonal: scaled.clone(),
-            scaled,
-            back,
-            diagonal: ch("preconditioner", n)?,
+            irradiance: upload_rgb(gpu, "irradiance", &initial.map_planes(|p| p.map(|v| v.max(DARKEST))))?,
+            old,
+            solution: ch("step", n)?,
             weight: ch("weights of sharp frames", n)?,
             observation: ch("observations of sharp frames", n)?,
             edge: gpu.plane("edge weights", n)?,
-            predicted: ch("prediction", if any_moving { m } else { 1 })?,
-            // Residuals of frames are back-projected before there is a search direction.
-            frame: direction.clone(),
+            back: some("back-projection", n)?,
+            predicted: some("prediction", if shaken > 0 { m } else { 1 })?,
+            misfit: misfit(&residual, &direction),
+            misfit_scratch: misfit(&product, &diagonal),
+            residual,
             direction,
-            misfit_scratch: gpu.plane("misfit", 2 * m)?,
-            partials: gpu.plane("partial sums", partials)?,
-            scalars: gpu.plane("scalars", 8)?,
+            product,
+            diagonal,
+            partials: gpu.plane("partial sums", together * need.partials)?,
+            scalars: gpu.plane("scalars", SCALARS)?,
             scratch,
         };
-        let misfit = gpu.plane("misfit", 2 * m)?;
         let mut observed = Vec::new();
-        for (i, (o, blur)) in observations.iter().zip(blurs).enumerate() {
-            let moving = match blur {
+        for (i, (o, operator)) in observations.iter().zip(operators).enumerate() {
+            let moving = match operator {
                 None => None,
                 Some(operator) => Some(Moving { operator, weight: ch("weights", m)?, observation: ch("observations", m)? }),
             };
-            let misfit = misfit.clone();
-            if memory.streamed {
-                // Weights are made when there is neither a step nor a back-projection.
+            let kept = if memory.streamed {
                 let planes = o.exposure.0.iter().chain(std::iter::once(&o.mask));
                 let mut host = planes.map(|p| gpu::finite(&format!("frame {}", i + 1), &p.data).map(|()| Arc::new(p.data.clone())));
                 let mut next = || host.next().expect("four planes");
-                let host = Some([next()?, next()?, next()?, next()?]);
-                observed.push(Observed { exposure: state.solution.clone(), mask: state.back[0].clone(), misfit, moving, host });
+                Kept::Host([next()?, next()?, next()?, next()?])
             } else {
-                let (exposure, mask) = (upload_rgb(gpu, "exposure", &o.exposure)?, gpu.upload("mask", &o.mask.data)?);
-                observed.push(Observed { exposure, mask, misfit, moving, host: None });
-            }
+                Kept::Device { exposure: upload_rgb(gpu, "exposure", &o.exposure)?, mask: gpu.upload("mask", &o.mask.data)? }
+            };
+            observed.push(Observed { kept, moving });
         }
         let mut solver = Self { gpu, kernels, settings, observations, observed, state, frame, latent, pad, memory };
         solver.mask_beyond()?;
@@ -456,38 +474,93 @@ impl<'a> Solver<'a> {
 
     /// Takes the pixels of blurred frames out of the masks that see beyond the latent grid: K of ones is less than 1 there.
     fn mask_beyond(&mut self) -> Result<()> {
-        let (n, m) = (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1);
+        let (n, m) = self.counts();
         // There is no search direction yet.
-        let ones: Channels = std::array::from_fn(|_| self.state.direction[0].clone());
-        self.gpu.submit(&[Step::Upload(Arc::new(vec![1.0; n]), ones[0].clone())]);
+        let ones = &self.state.direction[0];
+        self.gpu.submit(&[Step::Upload(Arc::new(vec![1.0; n]), ones.clone())]);
+        let ones = vec![ones.clone(); self.state.direction.len()];
         for (i, o) in self.observations.iter().enumerate() {
             if let Some(moving) = &self.observed[i].moving {
                 self.gpu.submit(&moving.forward(self, &ones, &self.state.predicted));
                 let seen = gpu::read(self.gpu, &self.state.predicted[0], m)?;
-                let mask: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
-                match &mut self.observed[i].host {
-                    Some(host) => host[3] = Arc::new(mask),
-                    None => self.gpu.submit(&[Step::Upload(Arc::new(mask), self.observed[i].mask.clone())]),
+                let inside: Vec<f32> = o.mask.data.iter().zip(&seen).map(|(&k, &s)| if (s - 1.0).abs() < 1e-3 { k } else { 0.0 }).collect();
+                match &mut self.observed[i].kept {
+                    Kept::Host(host) => host[3] = Arc::new(inside),
+                    Kept::Device { mask, .. } => self.gpu.submit(&[Step::Upload(Arc::new(inside), mask.clone())]),
                 }
             }
         }
         Ok(())
     }
 
-    fn source<'b>(&'b self, i: usize) -> MisfitSource<'b> {
-        let (o, observed) = (&self.observations[i], &self.observed[i]);
+    /// Pixels of the latent grid and of the frame.
+    fn counts(&self) -> (usize, usize) {
+        (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1)
+    }
+
+    /// The channels that are solved together, one group after another. Given the weights they are independent: one after another takes
+    /// less memory, and comes to the same.
+    fn groups(&self) -> impl Iterator<Item = Range<usize>> + use<> {
+        let together = self.memory.channels_together;
+        (0..3).step_by(together).map(move |c| c..c + together)
+    }
+
+    fn moving(&self) -> impl Iterator<Item = &Moving> {
+        self.observed.iter().filter_map(|o| o.moving.as_ref())
+    }
+
+    /// Channel `c` of frame `i` once [`Solver::predict`] has run for its group.
+    fn source<'b>(&'b self, i: usize, c: usize) -> MisfitSource<'b> {
+        let (o, observed, s) = (&self.observations[i], &self.observed[i], &self.state);
+        let at = c % self.memory.channels_together;
         let moving = observed.moving.is_some();
+        let (exposure, mask) = match &observed.kept {
+            Kept::Device { exposure, mask } => (&exposure[c], mask),
+            // Weights are made when there is neither a step nor a back-projection.
+            Kept::Host(_) => (&s.solution[at], &s.back[0]),
+        };
         MisfitSource {
             size: self.frame,
-            predicted: if moving { &self.state.predicted } else { &self.state.irradiance },
+            predicted: if moving { &s.predicted[at] } else { &s.irradiance[c] },
             predicted_offset: if moving { 0 } else { self.pad },
-            predicted_stride: if moving { self.frame.0 } else { self.latent.0 },
-            exposure: &observed.exposure,
-            mask: &observed.mask,
+            predicted_size: if moving { self.frame } else { self.latent },
+            exposure,
+            mask,
             exposure_time: o.exposure_time as f32,
             black_clipped: o.black_clipped,
-            noise: &o.noise,
+            noise: &o.noise[c],
         }
+    }
+
+    /// Steps after which exposure, mask and prediction of some channels of frame `i` are on the device.
+    fn predict(&self, i: usize, group: &Range<usize>) -> Vec<Step> {
+        let s = &self.state;
+        let mut steps = Vec::new();
+        if let Kept::Host(host) = &self.observed[i].kept {
+            steps.extend(group.clone().zip(&s.solution).map(|(c, to)| Step::Upload(host[c].clone(), to.clone())));
+            steps.push(Step::Upload(host[3].clone(), s.back[0].clone()));
+        }
+        if let Some(moving) = &self.observed[i].moving {
+            steps.extend(moving.forward(self, &s.irradiance[group.clone()], &s.predicted));
+        }
+        steps
+    }
+
+    /// Steps of the misfit of each pixel of frame `i`.
+    fn misfit(&self, i: usize) -> Vec<Step> {
+        let mut steps = Vec::new();
+        for group in self.groups() {
+            steps.extend(self.predict(i, &group));
+            for c in group {
+                steps.extend(self.kernels.data.misfit(self.gpu, &self.source(i, c), &self.state.misfit, c > 0));
+            }
+        }
+        steps
+    }
+
+    /// Steps that make the misfit local.
+    fn local(&self) -> Vec<Step> {
+        self.kernels.data.local(self.gpu, &self.state.misfit, &self.state.misfit_scratch, self.frame)
     }
 
     /// Weights and weighted observations of all frames at the present estimate.
@@ -496,186 +569,164 @@ impl<'a> Solver<'a> {
         let mut steps = Vec::new();
         let mut first = true;
         for (i, observed) in self.observed.iter().enumerate() {
-            steps.extend(observed.uploads());
-            match &observed.moving {
-                None => {
-                    steps.push(Step::Clear(observed.misfit.clone()));
-                    let to = WeightTarget {
-                        weight: &s.weight,
-                        observation: &s.observation,
-                        offset: self.pad,
-                        stride: self.latent.0,
-                        accumulate: !first,
-                    };
-                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, 0.0, &to));
-                    first = false;
+            let robust = match &observed.moving {
+                None => 0.0,
+                Some(moving) if moving.operator.still => STILL_ROBUST * robust,
+                Some(_) => robust,
+            };
+            if robust > 0.0 {
+                steps.extend(self.misfit(i));
+                steps.extend(self.local());
+            } else {
+                steps.extend([&s.misfit.sum, &s.misfit.counted].map(|b| Step::Clear(b.clone())));
+            }
+            for group in self.groups() {
+                // That of the only group is there already, for the misfit.
+                if robust == 0.0 || group.len() < 3 {
+                    steps.extend(self.predict(i, &group));
                 }
-                Some(moving) => {
-                    steps.extend(moving.forward(self, &s.irradiance, &s.predicted));
-                    steps.extend(data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch));
-                    let to = WeightTarget {
-                        weight: &moving.weight,
-                        observation: &moving.observation,
-                        offset: 0,
-                        stride: self.frame.0,
-                        accumulate: false,
+                for c in group {
+                    let to = match &observed.moving {
+                        None => WeightTarget {
+                            weight: &s.weight[c],
+                            observation: &s.observation[c],
+                            offset: self.pad,
+                            size: self.latent,
+                            accumulate: !first,
+                        },
+                        Some(moving) => WeightTarget {
+                            weight: &moving.weight[c],
+                            observation: &moving.observation[c],
+                            offset: 0,
+                            size: self.frame,
+                            accumulate: false,
+                        },
                     };
-                    let robust = if moving.operator.still { STILL_ROBUST * robust } else { robust };
-                    steps.extend(data.weights(self.gpu, &self.source(i), &observed.misfit, robust, &to));
+                    steps.extend(data.weights(self.gpu, &self.source(i, c), &s.misfit, robust, &to));
                 }
             }
+            first &= observed.moving.is_some();
         }
         steps
     }
 
-    /// Σ K^T W (B - K E) into `back`, the data term into its scalar.
-    fn residuals(&self, project_back: bool) -> Vec<Step> {
-        let (s, k) = (&self.state, self.kernels);
-        let (n, m) = (self.latent.0 * self.latent.1, self.frame.0 * self.frame.1);
+    /// Σ K^T W (B - K E) of some channels into `back`, their data terms into their scalars.
+    fn residuals(&self, group: &Range<usize>, project_back: bool) -> Vec<Step> {
+        let (s, data) = (&self.state, &self.kernels.data);
+        let (n, m) = self.counts();
+        let (in_place, displaced) = (partials_1d(self.gpu, n), partials_1d(self.gpu, m));
+        let each = in_place + self.moving().count() * displaced;
         let mut steps = Vec::new();
-        let mut partial = 0;
-        for c in 0..3 {
-            steps.push(k.data.residual(self.gpu, &s.irradiance[c], &s.weight[c], &s.observation[c], &s.back[c], &s.partials, partial, n));
-            partial += partials_1d(n);
+        for (k, c) in group.clone().enumerate() {
+            let (w, o) = (&s.weight[c], &s.observation[c]);
+            steps.extend(data.residual(self.gpu, &s.irradiance[c], w, o, &s.back[k], &s.partials, k * each, n));
         }
-        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.forward(self, &s.irradiance, &s.predicted));
-            for c in 0..3 {
-                let (w, o) = (&moving.weight[c], &moving.observation[c]);
-                steps.push(k.data.residual(self.gpu, &s.predicted[c], w, o, &s.frame[c], &s.partials, partial, m));
-                partial += partials_1d(m);
+        for (i, moving) in self.moving().enumerate() {
+            steps.extend(moving.forward(self, &s.irradiance[group.clone()], &s.predicted));
+            for (k, c) in group.clone().enumerate() {
+                let (w, o, partial) = (&moving.weight[c], &moving.observation[c], k * each + in_place + i * displaced);
+                // There is no search direction yet.
+                steps.extend(data.residual(self.gpu, &s.predicted[k], w, o, &s.direction[k], &s.partials, partial, m));
             }
             if project_back {
-                steps.extend(moving.adjoint(self, &s.frame, &s.back, 1.0));
+                steps.extend(moving.adjoint(self, &s.direction, &s.back, 1.0));
             }
         }
-        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, partial, SLOT_DATA, false));
+        steps.push(self.kernels.linear.sum(self.gpu, &s.partials, &s.scalars, group.clone(), each, SLOT_DATA, false));
         steps
     }
 
     fn edges(&self) -> Vec<Step> {
-        let (s, set) = (&self.state, self.settings);
-        let linear = &self.kernels.linear;
-        vec![
-            linear.edge_weight(self.gpu, &s.log, &s.edge, &s.partials, set.prior.smoothness(set.lambda), set.epsilon, self.latent),
-            linear.sum(self.gpu, &s.partials, &s.scalars, partials_2d(self.latent), SLOT_SMOOTHNESS, false),
-        ]
+        let (s, set, linear) = (&self.state, self.settings, &self.kernels.linear);
+        let lambda = set.prior.smoothness(set.lambda);
+        let mut steps = linear.edge_weight(self.gpu, &s.irradiance, &s.edge, &s.partials, lambda, set.epsilon, self.latent);
+        let partials = partials_2d(self.gpu, self.latent);
+        steps.push(linear.sum(self.gpu, &s.partials, &s.scalars, 0..1, partials, SLOT_SMOOTHNESS, false));
+        steps
     }
 
-    /// Steps of the diagonal of Σ Kᵀ W K, roughly, over the frames in place and those that `counts` holds for.
-    fn diagonal(&self, counts: fn(&Moving) -> bool) -> Vec<Step> {
+    /// Steps of the diagonal of Σ Kᵀ W K of some channels, roughly, over the frames in place and those that `counts` holds for; into `product`.
+    fn diagonal(&self, group: &Range<usize>, counts: fn(&Moving) -> bool) -> Vec<Step> {
         let s = &self.state;
-        let mut steps: Vec<Step> = (0..3).map(|c| Step::Copy(s.weight[c].clone(), s.data_diagonal[c].clone())).collect();
-        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(|m| counts(m)) {
-            steps.extend(moving.adjoint(self, &moving.weight, &s.data_diagonal, moving.operator.energy));
+        let mut steps: Vec<Step> = group.clone().zip(&s.product).map(|(c, to)| Step::Copy(s.weight[c].clone(), to.clone())).collect();
+        for moving in self.moving().filter(|m| counts(m)) {
+            steps.extend(moving.adjoint(self, &moving.weight[group.clone()], &s.product, moving.operator.energy));
         }
         steps
     }
 
-    /// Right-hand side, preconditioner and the start of the conjugate gradients.
-    fn start(&self) -> Vec<Step> {
-        let (s, k) = (&self.state, self.kernels);
-        let n = self.latent.0 * self.latent.1;
-        let mut steps = self.diagonal(|_| true);
-        for c in 0..3 {
-            steps.push(k.linear.right_side(
-                self.gpu,
-                &s.irradiance[c],
-                &s.back[c],
-                &s.edge,
-                &s.log[c],
-                &s.data_diagonal[c],
-                &s.residual[c],
-                &s.diagonal[c],
-                self.latent,
-            ));
-            let partial = c * partials_1d(n);
-            steps.push(k.linear.cg_start(
-                self.gpu,
-                &s.residual[c],
-                &s.diagonal[c],
-                &s.solution[c],
-                &s.direction[c],
-                &s.partials,
-                partial,
-                n,
-            ));
+    /// Right-hand side, preconditioner and the start of the conjugate gradients of some channels.
+    fn start(&self, group: &Range<usize>) -> Vec<Step> {
+        let (s, linear) = (&self.state, &self.kernels.linear);
+        let n = self.counts().0;
+        let partials = partials_1d(self.gpu, n);
+        let mut steps = self.diagonal(group, |_| true);
+        for (k, c) in group.clone().enumerate() {
+            let (r, d) = (&s.residual[k], &s.diagonal[k]);
+            steps.extend(linear.right_side(self.gpu, &s.irradiance[c], &s.back[k], &s.edge, &s.product[k], r, d, self.latent));
+            steps.extend(linear.cg_start(self.gpu, r, d, &s.solution[c], &s.direction[k], &s.partials, k * partials, n));
         }
-        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_1d(n), SLOT_ENERGY, true));
+        steps.push(linear.sum(self.gpu, &s.partials, &s.scalars, group.clone(), partials, SLOT_ENERGY, true));
         steps
     }
 
-    /// One iteration of the conjugate gradients.
-    fn iteration(&self) -> Vec<Step> {
-        let (s, k) = (&self.state, self.kernels);
-        let n = self.latent.0 * self.latent.1;
+    /// One iteration of the conjugate gradients of some channels.
+    fn iteration(&self, group: &Range<usize>) -> Vec<Step> {
+        let (s, linear) = (&self.state, &self.kernels.linear);
+        let (n, m) = self.counts();
+        let (flat, square) = (partials_1d(self.gpu, n), partials_2d(self.gpu, self.latent));
+        let sum = |count, slot, shift| linear.sum(self.gpu, &s.partials, &s.scalars, group.clone(), count, slot, shift);
         let mut steps = Vec::new();
-        for c in 0..3 {
-            steps.push(k.linear.scale(self.gpu, &s.irradiance[c], &s.direction[c], &s.weight[c], &s.scaled[c], &s.back[c], n));
+        for (k, c) in group.clone().enumerate() {
+            // The product is written after the scaled direction was projected.
+            steps.extend(linear.scale(self.gpu, &s.irradiance[c], &s.direction[k], &s.weight[c], &s.product[k], &s.back[k], n));
         }
-        for moving in self.observed.iter().filter_map(|o| o.moving.as_ref()) {
-            steps.extend(moving.forward(self, &s.scaled, &s.predicted));
-            for c in 0..3 {
-                steps.push(k.linear.multiply(self.gpu, &moving.weight[c], &s.predicted[c], self.frame.0 * self.frame.1));
+        for moving in self.moving() {
+            steps.extend(moving.forward(self, &s.product, &s.predicted));
+            for (k, c) in group.clone().enumerate() {
+                steps.extend(linear.multiply(self.gpu, &moving.weight[c], &s.predicted[k], m));
             }
             steps.extend(moving.adjoint(self, &s.predicted, &s.back, 1.0));
         }
-        for c in 0..3 {
-            let partial = c * partials_2d(self.latent);
-            steps.push(k.linear.normal(
-                self.gpu,
-                &s.irradiance[c],
-                &s.back[c],
-                &s.edge,
-                &s.direction[c],
-                &s.product[c],
-                &s.partials,
-                partial,
-                self.latent,
-            ));
+        for (k, c) in group.clone().enumerate() {
+            let (e, b, p, q) = (&s.irradiance[c], &s.back[k], &s.direction[k], &s.product[k]);
+            steps.extend(linear.normal(self.gpu, e, b, &s.edge, p, q, &s.partials, k * square, self.latent));
         }
-        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_2d(self.latent), SLOT_CURVATURE, false));
-        for c in 0..3 {
-            steps.push(k.linear.cg_step(
-                self.gpu,
-                &s.scalars,
-                &s.direction[c],
-                &s.product[c],
-                &s.diagonal[c],
-                &s.solution[c],
-                &s.residual[c],
-                &s.partials,
-                c * partials_1d(n),
-                n,
-            ));
+        steps.push(sum(square, SLOT_CURVATURE, false));
+        for (k, c) in group.clone().enumerate() {
+            let (p, q, d, x, r) = (&s.direction[k], &s.product[k], &s.diagonal[k], &s.solution[c], &s.residual[k]);
+            steps.extend(linear.cg_step(self.gpu, &s.scalars, c, p, q, d, x, r, &s.partials, k * flat, n));
         }
-        steps.push(k.linear.sum(self.gpu, &s.partials, &s.scalars, 3 * partials_1d(n), SLOT_ENERGY, true));
-        for c in 0..3 {
-            steps.push(k.linear.cg_direction(self.gpu, &s.scalars, &s.residual[c], &s.diagonal[c], &s.direction[c], n));
+        steps.push(sum(flat, SLOT_ENERGY, true));
+        for (k, c) in group.clone().enumerate() {
+            steps.extend(linear.cg_direction(self.gpu, &s.scalars, c, &s.residual[k], &s.diagonal[k], &s.direction[k], n));
         }
         steps
     }
 
-    fn scalar(&self, slot: u32) -> Result<f64> {
-        Ok(f64::from(gpu::read(self.gpu, &self.state.scalars, 8)?[slot as usize]))
+    /// Sum of scalar `slot` over some channels.
+    fn scalar(&self, group: &Range<usize>, slot: usize) -> Result<f64> {
+        let scalars = gpu::read(self.gpu, &self.state.scalars, SCALARS)?;
+        Ok(group.clone().map(|c| f64::from(scalars[SLOTS * c + slot])).sum())
     }
 
     fn objective(&self) -> Result<f64> {
-        let s = gpu::read(self.gpu, &self.state.scalars, 8)?;
-        Ok(f64::from(s[SLOT_DATA as usize]) + f64::from(s[SLOT_SMOOTHNESS as usize]))
+        let smoothness = gpu::read(self.gpu, &self.state.scalars, SCALARS)?[SLOT_SMOOTHNESS];
+        Ok(self.scalar(&(0..3), SLOT_DATA)? + f64::from(smoothness))
     }
 
     fn run(&self, progress: &mut dyn FnMut(f32) -> bool) -> Result<Solution> {
         let (s, set) = (&self.state, self.settings);
-        let n = self.latent.0 * self.latent.1;
-        let (weigh, residuals, edges, start, iteration) =
-            (self.weigh(set.robust), self.residuals(true), self.edges(), self.start(), self.iteration());
-        let trusting = self.weigh(0.0);
-        let evaluate = [self.residuals(false), self.edges()].concat();
+        let n = self.counts().0;
+        let (weigh, trusting, edges) = (self.weigh(set.robust), self.weigh(0.0), self.edges());
+        let systems: Vec<(Range<usize>, Vec<Step>, Vec<Step>)> =
+            self.groups().map(|g| (g.clone(), [self.residuals(&g, true), self.start(&g)].concat(), self.iteration(&g))).collect();
+        let evaluate: Vec<Step> = self.groups().flat_map(|g| self.residuals(&g, false)).chain(self.edges()).collect();
         let update = |step: f32| -> Vec<Step> {
-            (0..3).map(|c| self.kernels.linear.update(self.gpu, &s.old[c], &s.solution[c], &s.log[c], &s.irradiance[c], step, n)).collect()
+            let one = |c: usize| self.kernels.linear.update(self.gpu, &s.old[c], &s.solution[c], &s.irradiance[c], step, DARKEST, n);
+            (0..3).flat_map(one).collect()
         };
-        let keep: Vec<Step> = (0..3).map(|c| Step::Copy(s.log[c].clone(), s.old[c].clone())).collect();
+        let keep: Vec<Step> = s.irradiance.iter().zip(&s.old).map(|(from, to)| Step::Copy(from.clone(), to.clone())).collect();
         let mut history = Vec::new();
         let mut stop = Stop::IterationLimit;
         let mut settled = set.robust == 0.0 || set.settled == f64::INFINITY;
@@ -683,22 +734,26 @@ impl<'a> Solver<'a> {
             if outer == 0 || set.reweight {
                 self.gpu.submit(if settled { &weigh } else { &trusting });
             }
-            self.gpu.submit(&residuals);
             self.gpu.submit(&edges);
-            self.gpu.submit(&start);
-            let before = self.objective()?;
-            let energy = self.scalar(SLOT_ENERGY)?;
-            for i in 0..set.inner {
-                self.gpu.submit(&iteration);
-                // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
-                if i % 5 == 4 || i + 1 == set.inner {
-                    self.scalar(SLOT_ENERGY)?;
-                    if !progress(ITERATING * (outer as f32 + (i + 1) as f32 / set.inner as f32) / set.outer as f32) {
-                        return Err(Error::Cancelled);
+            let (mut energy, mut left) = (0.0, 0.0);
+            for (number, (group, start, iteration)) in systems.iter().enumerate() {
+                self.gpu.submit(start);
+                energy += self.scalar(group, SLOT_ENERGY)?;
+                for i in 0..set.inner {
+                    self.gpu.submit(iteration);
+                    // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
+                    if i % 5 == 4 || i + 1 == set.inner {
+                        self.scalar(group, SLOT_ENERGY)?;
+                        let done = (number as f32 + (i + 1) as f32 / set.inner as f32) / systems.len() as f32;
+                        if !progress(ITERATING * (outer as f32 + done) / set.outer as f32) {
+                            return Err(Error::Cancelled);
+                        }
                     }
                 }
+                left += self.scalar(group, SLOT_ENERGY)?;
             }
-            let reduction = self.scalar(SLOT_ENERGY)? / energy.max(f64::MIN_POSITIVE);
+            let reduction = left / energy.max(f64::MIN_POSITIVE);
+            let before = self.objective()?;
             self.gpu.submit(&keep);
             let mut step = 1.0f32;
             let mut after;
@@ -733,21 +788,19 @@ impl<'a> Solver<'a> {
 
     /// χ² of each frame at the present estimate, as a whole and locally.
     fn judge(&self) -> Result<(Vec<f64>, Vec<Plane>)> {
-        let (s, m) = (&self.state, self.frame.0 * self.frame.1);
+        let m = self.counts().1;
         let (mut chi_squared, mut misfit) = (Vec::new(), Vec::new());
-        for (i, observed) in self.observed.iter().enumerate() {
-            if let Some(moving) = &observed.moving {
-                self.gpu.submit(&moving.forward(self, &s.irradiance, &s.predicted));
-            }
-            self.gpu.submit(&observed.uploads());
-            let steps = self.kernels.data.misfit(self.gpu, &self.source(i), &observed.misfit, &s.misfit_scratch);
-            self.gpu.submit(&steps[..1]);
-            let pairs = gpu::read(self.gpu, &observed.misfit, 2 * m)?;
-            let (chi, count) = pairs.chunks_exact(2).fold((0.0, 0.0), |(a, b), p| (a + f64::from(p[0]), b + f64::from(p[1])));
+        let read =
+            || Ok::<_, Error>((gpu::read(self.gpu, &self.state.misfit.sum, m)?, gpu::read(self.gpu, &self.state.misfit.counted, m)?));
+        for i in 0..self.observed.len() {
+            self.gpu.submit(&self.misfit(i));
+            let (sum, counted) = read()?;
+            let total = |v: &[f32]| v.iter().map(|&v| f64::from(v)).sum::<f64>();
+            let (chi, count) = (total(&sum), total(&counted));
             chi_squared.push(if count > 0.0 { chi / count } else { f64::NAN });
-            self.gpu.submit(&steps[1..]);
-            let pairs = gpu::read(self.gpu, &observed.misfit, 2 * m)?;
-            let local = pairs.chunks_exact(2).map(|p| if p[1] > 1e-3 { p[0] / p[1] } else { 0.0 }).collect();
+            self.gpu.submit(&self.local());
+            let (sum, counted) = read()?;
+            let local = sum.iter().zip(&counted).map(|(s, n)| if *n > 1e-3 { s / n } else { 0.0 }).collect();
             misfit.push(Plane::from_vec(self.frame.0, self.frame.1, local)?);
         }
         Ok((chi_squared, misfit))

@@ -7,6 +7,7 @@ use crate::gpu::{self, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::Channels;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// What irradiance is taken to look like before a frame is seen.
@@ -76,27 +77,38 @@ fn offset(weights: &Precision) -> f32 {
 impl Solver<'_> {
     /// Inverse variance of irradiance that the frames give at the present estimate.
     fn precision(&self) -> Result<Precision> {
-        let s = &self.state;
+        let to = &self.state.product;
         self.gpu.submit(&self.weigh(self.settings.robust));
-        // The interpolation has negative lobes.
-        let given = |weights: &Channels| Ok::<_, Error>(self.read(weights)?.map_planes(|p| p.map(|w| w.max(0.0))));
-        let to = &s.data_diagonal;
-        self.gpu.submit(&self.diagonal(|m| m.operator.still));
-        let white = given(to)?;
+        // What `steps` of each group of channels leave in `product`. The interpolation has negative lobes.
+        let given = |steps: &dyn Fn(&Range<usize>) -> Vec<Step>| {
+            let mut planes = Vec::new();
+            for group in self.groups() {
+                self.gpu.submit(&steps(&group));
+                for plane in to {
+                    planes.push(self.read_plane(plane)?.map(|w| w.max(0.0)));
+                }
+            }
+            Ok::<_, Error>(Rgb(planes.try_into().expect("three channels")))
+        };
+        let white = given(&|group| self.diagonal(group, |m| m.operator.still))?;
         let mut shaken = Vec::new();
-        for m in self.observed.iter().filter_map(|o| o.moving.as_ref()).filter(|m| !m.operator.still) {
-            let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
-            steps.extend(m.adjoint(self, &m.weight, to, 1.0));
-            self.gpu.submit(&steps);
-            shaken.push((given(to)?, power(&m.operator.psf)));
+        for m in self.moving().filter(|m| !m.operator.still) {
+            let own = given(&|group| {
+                let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
+                steps.extend(m.adjoint(self, &m.weight[group.clone()], to, 1.0));
+                steps
+            })?;
+            shaken.push((own, power(&m.operator.psf)));
         }
         Ok(Precision { white, shaken })
     }
 
+    fn read_plane(&self, plane: &wgpu::Buffer) -> Result<Plane> {
+        Plane::from_vec(self.latent.0, self.latent.1, gpu::read(self.gpu, plane, self.latent.0 * self.latent.1)?)
+    }
+
     pub(super) fn read(&self, planes: &Channels) -> Result<Rgb> {
-        let plane =
-            |c: usize| Plane::from_vec(self.latent.0, self.latent.1, gpu::read(self.gpu, &planes[c], self.latent.0 * self.latent.1)?);
-        Ok(Rgb([plane(0)?, plane(1)?, plane(2)?]))
+        Ok(Rgb([self.read_plane(&planes[0])?, self.read_plane(&planes[1])?, self.read_plane(&planes[2])?]))
     }
 
     /// Replaces the estimate by what collaborative filtering makes of it.
@@ -114,13 +126,10 @@ impl Solver<'_> {
         }
         let log = irradiance.map_planes(|p| p.map(|e| (e + offset).ln()));
         let filtered = collaborative::filtered(&log, &precision, strength, progress).ok_or(Error::Cancelled)?;
-        let floor = (1e-3 * offset).max(f32::MIN_POSITIVE);
+        let floor = (1e-3 * offset).max(super::DARKEST);
         let irradiance = filtered.map_planes(|p| p.map(|g| (g.exp() - offset).max(floor)));
-        let put = |image: Rgb, to: &Channels| -> Vec<Step> {
-            image.0.into_iter().zip(to).map(|(plane, to)| Step::Upload(Arc::new(plane.data), to.clone())).collect()
-        };
-        self.gpu.submit(&put(irradiance.map_planes(|p| p.map(f32::ln)), &self.state.log));
-        self.gpu.submit(&put(irradiance, &self.state.irradiance));
+        let put = |(plane, to): (Plane, &wgpu::Buffer)| Step::Upload(Arc::new(plane.data), to.clone());
+        self.gpu.submit(&irradiance.0.into_iter().zip(&self.state.irradiance).map(put).collect::<Vec<_>>());
         Ok(())
     }
 }

@@ -204,17 +204,44 @@ impl Gpu {
         (rows + ROW_STEP).min(size.1) * size.0 <= self.max_binding()
     }
 
-    /// The rows `rows` of an image of `width` values per row: the whole buffer where one binding holds it, else a part that begins at or
-    /// a little before `rows`.
-    pub fn rows<'a>(&self, buffer: &'a wgpu::Buffer, width: usize, rows: std::ops::Range<usize>) -> Rows<'a> {
-        if buffer.size() <= self.binding_limit {
-            return Rows { binding: buffer.as_entire_buffer_binding(), first: 0 };
+    /// The rows `rows` of an image of `size` = (width, height) at the start of `buffer`: the whole buffer where one binding holds the image,
+    /// else a part that begins at or a little before `rows`, at the same row for all images of this size.
+    pub fn rows<'a>(&self, buffer: &'a wgpu::Buffer, size: (usize, usize), rows: std::ops::Range<usize>) -> Rows<'a> {
+        let (width, last) = size;
+        if width * last <= self.max_binding() {
+            let binding = if buffer.size() <= self.binding_limit {
+                buffer.as_entire_buffer_binding()
+            } else {
+                Self::part(buffer, &(0..width * last))
+            };
+            return Rows { binding, first: 0 };
         }
-        let last = (buffer.size() / 4) as usize / width;
         let first = rows.start.min(last.saturating_sub(1)) / ROW_STEP * ROW_STEP;
-        let (offset, end) = ((first * width * 4) as u64, (rows.end.clamp(first + 1, last) * width * 4) as u64);
-        debug_assert!(end - offset <= self.binding_limit, "callers ask rows_fit");
-        Rows { binding: wgpu::BufferBinding { buffer, offset, size: std::num::NonZero::new(end - offset) }, first }
+        let end = rows.end.clamp(first + 1, last);
+        debug_assert!((end - first) * width <= self.max_binding(), "callers ask rows_fit");
+        Rows { binding: Self::part(buffer, &(first * width..end * width)), first }
+    }
+
+    /// Bands of `count` rows of which [`Gpu::rows`] can bind each, with `halo` rows more above and below, in an image of at most
+    /// `size` = (width, height); where it can bind one row like this ([`Gpu::rows_fit`]).
+    pub fn bands(&self, count: usize, halo: usize, size: (usize, usize)) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
+        let mut rows = count.max(1);
+        while rows > 1 && !self.rows_fit(rows + 2 * halo, size) {
+            rows = rows.div_ceil(2);
+        }
+        (0..count).step_by(rows).map(move |y| y..(y + rows).min(count))
+    }
+
+    /// Parts of `count` values of which one binding each holds, of a multiple of `step` (a power of two, 64 at least) but for the last.
+    pub fn parts(&self, count: usize, step: usize) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
+        let most = (self.max_binding() / step * step).max(step);
+        (0..count).step_by(most).map(move |i| i..(i + most).min(count))
+    }
+
+    /// The values `values` of a buffer, of which the first is a multiple of 64.
+    pub fn part<'a>(buffer: &'a wgpu::Buffer, values: &std::ops::Range<usize>) -> wgpu::BufferBinding<'a> {
+        let size = std::num::NonZero::new(((values.end - values.start) * 4) as u64);
+        wgpu::BufferBinding { buffer, offset: (values.start * 4) as u64, size }
     }
 
     /// A storage buffer of `count` zeros.

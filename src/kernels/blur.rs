@@ -1,4 +1,4 @@
-//! The blur K of eq. (4) and its exact adjoint Kᵀ, three channels, as warps and shifts (see [`TapSet`]), in two designs:
+//! The blur K of eq. (4) and its exact adjoint Kᵀ, of three channels or one, as warps and shifts (see [`TapSet`]), in two designs:
 //!
 //! * rotate-then-shift: every base warp into a scratch plane, then the sum of shifted planes. Loads little, needs scratch.
 //! * direct: every pose warped straight into the sum. For a set whose taps shift nothing (a pose of its own per tap), above all for a
@@ -8,12 +8,12 @@
 //! frame from the scratch rows that its shifts reach; Kᵀ adds to the latent grid what a band of scratch rows holds. What either reads is
 //! copied with a margin of zeros first.
 
-use super::Channels;
 use crate::error::Result;
 use crate::gpu::{Gpu, Kernel, Step};
 use crate::tsf::{Interpolation, TapSet};
 use glam::{DMat3, DVec2};
 use std::ops::Range;
+use std::sync::OnceLock;
 
 pub(super) const PADDED: &str = concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/padded.wgsl"));
 pub(super) const WARP: &str = concat!(
@@ -114,28 +114,41 @@ pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
 
 /// The compiled kernels of K and Kᵀ.
 pub struct BlurKernels {
+    support: usize,
+    /// For one channel and for three.
+    compiled: [OnceLock<Compiled>; 2],
+}
+
+struct Compiled {
     padded: Kernel,
     /// Overwriting, adding.
     warp: [Kernel; 2],
     warp_adjoint: Kernel,
     warp_adjoint_near: Kernel,
     tap_sum: [Kernel; 2],
-    support: usize,
 }
 
 impl BlurKernels {
-    /// Compiles them for one interpolation.
-    pub fn new(gpu: &Gpu, interpolation: Interpolation) -> Self {
-        let support = interpolation.support();
-        let constants = [("SUPPORT", support as f64)];
-        Self {
-            padded: Kernel::new(gpu, "padded", PADDED, &[]),
-            warp: [0.0, 1.0].map(|add| Kernel::new(gpu, "warp", WARP, &[constants[0], ("ACCUMULATE", add)])),
-            warp_adjoint: Kernel::new(gpu, "warp_adjoint", WARP_ADJOINT, &constants),
-            warp_adjoint_near: Kernel::new(gpu, "warp_adjoint_near", WARP_ADJOINT_NEAR, &constants),
-            tap_sum: [0.0, 1.0].map(|add| Kernel::new(gpu, "tap_sum", TAP_SUM, &[("ACCUMULATE", add)])),
-            support,
-        }
+    /// Those of one interpolation, compiled when first used.
+    pub fn new(interpolation: Interpolation) -> Self {
+        Self { support: interpolation.support(), compiled: Default::default() }
+    }
+
+    /// The kernels for `channels` channels at a time.
+    fn compiled(&self, gpu: &Gpu, channels: usize) -> &Compiled {
+        self.compiled[usize::from(channels > 1)].get_or_init(|| {
+            let constants = [("SUPPORT", self.support as f64), ("CHANNELS", channels as f64)];
+            let adding = |label, source, constants: &[(&'static str, f64)]| {
+                [0.0, 1.0].map(|add| Kernel::new(gpu, label, source, &[constants, &[("ACCUMULATE", add)]].concat()))
+            };
+            Compiled {
+                padded: Kernel::new(gpu, "padded", PADDED, &constants[1..]),
+                warp: adding("warp", WARP, &constants),
+                warp_adjoint: Kernel::new(gpu, "warp_adjoint", WARP_ADJOINT, &constants),
+                warp_adjoint_near: Kernel::new(gpu, "warp_adjoint_near", WARP_ADJOINT_NEAR, &constants),
+                tap_sum: adding("tap_sum", TAP_SUM, &constants[1..]),
+            }
+        })
     }
 }
 
@@ -195,30 +208,62 @@ impl ScratchSize {
         Self { planes: self.planes.min(other.planes), copy: self.copy.min(other.copy) }
     }
 
-    /// Bytes of three channels.
-    pub fn bytes(self) -> u64 {
-        12 * (self.planes.max(2) + self.copy.max(2)) as u64
+    /// Bytes for `channels` channels.
+    pub fn bytes(self, channels: usize) -> u64 {
+        4 * (channels * (self.planes.max(2) + self.copy.max(2)) + 3 * UNUSED) as u64
     }
 }
 
+/// Values of a buffer that stands for the channels that are not there.
+const UNUSED: usize = 2;
+
 /// Scratch planes for copies and base warps, shared by all operators of one solver.
 pub struct Scratch {
-    planes: Channels,
-    copy: Channels,
+    planes: Vec<wgpu::Buffer>,
+    copy: Vec<wgpu::Buffer>,
+    /// Bound for the channels that are not there: for inputs, for the second output, for the third.
+    unused: [wgpu::Buffer; 3],
     size: ScratchSize,
 }
 
 impl Scratch {
-    /// Scratch of `size`.
+    /// Scratch of `size` for operators on `channels` channels at a time, 1 or 3.
     ///
     /// # Errors
     /// As [`Gpu::plane`].
-    pub fn new(gpu: &Gpu, size: ScratchSize) -> Result<Self> {
-        Ok(Self {
-            planes: super::channels(gpu, "base warps", size.planes)?,
-            copy: super::channels(gpu, "copy with margin", size.copy)?,
-            size,
-        })
+    pub fn new(gpu: &Gpu, size: ScratchSize, channels: usize) -> Result<Self> {
+        let make = |label, count| (0..channels).map(|_| gpu.plane(label, count)).collect::<Result<Vec<_>>>();
+        let unused = [gpu.plane("unused input", UNUSED)?, gpu.plane("unused output", UNUSED)?, gpu.plane("unused output", UNUSED)?];
+        Ok(Self { planes: make("base warps", size.planes)?, copy: make("copy with margin", size.copy)?, unused, size })
+    }
+
+    /// Channels at a time: 1 or 3.
+    pub fn channels(&self) -> usize {
+        self.copy.len()
+    }
+
+    /// `parts` of one or three channels as the kernels' bindings of inputs or outputs.
+    fn bound<'a>(&'a self, parts: &[wgpu::BufferBinding<'a>], output: bool) -> [wgpu::BufferBinding<'a>; 3] {
+        let unused = |c: usize| self.unused[if output { c } else { 0 }].as_entire_buffer_binding();
+        std::array::from_fn(|c| parts.get(c).cloned().unwrap_or_else(|| unused(c)))
+    }
+
+    fn whole<'a>(&'a self, buffers: &'a [wgpu::Buffer], output: bool) -> [wgpu::BufferBinding<'a>; 3] {
+        self.bound(&buffers.iter().map(|b| b.as_entire_buffer_binding()).collect::<Vec<_>>(), output)
+    }
+
+    /// The rows `rows` of images of `size` as bindings, and the row that comes first in them.
+    fn rows<'a>(
+        &'a self,
+        gpu: &Gpu,
+        images: &'a [wgpu::Buffer],
+        size: (usize, usize),
+        rows: Range<usize>,
+        output: bool,
+    ) -> ([wgpu::BufferBinding<'a>; 3], i32) {
+        let parts: Vec<_> = images.iter().map(|b| gpu.rows(b, size, rows.clone())).collect();
+        let first = parts[0].first as i32;
+        (self.bound(&parts.into_iter().map(|p| p.binding).collect::<Vec<_>>(), output), first)
     }
 }
 
@@ -440,6 +485,11 @@ impl Blur {
         self.scratch_for(Cut { rows: 1, bases: 1 })
     }
 
+    /// Rows of the latent grid or of the frame that the lowest band reads or adds to at once: fewer cannot be bound.
+    pub fn rows_at_once(&self) -> usize {
+        (self.forward_copy(1) / (self.latent.0 + 2 * MARGIN)).max(self.adjoint_rows(1)).max(1 + self.shifts().1)
+    }
+
     /// Bands and passes that scratch, bindings and the time of a dispatch allow.
     fn cut(&self, gpu: &Gpu, scratch: &Scratch) -> Cut {
         let all = self.homographies.len();
@@ -493,30 +543,37 @@ impl Blur {
     fn copy(
         &self,
         gpu: &Gpu,
-        kernels: &BlurKernels,
+        kernels: &Compiled,
         scratch: &Scratch,
-        from: &Channels,
+        from: &[wgpu::Buffer],
         size: (usize, usize),
         first: i32,
         width: usize,
         rows: &Range<i32>,
     ) -> Step {
         let inside = rows.start.clamp(0, size.1 as i32) as usize..rows.end.clamp(0, size.1 as i32) as usize;
-        let bound = from.each_ref().map(|b| gpu.rows(b, size.0, inside.clone()));
+        let ([r, g, b], in_first) = scratch.rows(gpu, from, size, inside, false);
         let params = PaddedParams {
             in_size: [size.0 as i32, size.1 as i32],
             out_size: [width as i32, rows.len() as i32],
             origin: [first, rows.start],
-            in_first: bound[0].first as i32,
+            in_first,
             _pad: 0,
         };
-        let [r, g, b] = bound.map(|b| b.binding);
-        let [x, y, z] = scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
+        let [x, y, z] = scratch.whole(&scratch.copy, true);
         kernels.padded.step_parts(gpu, &params, &[r, g, b, x, y, z], [width.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1])
     }
 
-    /// Steps of `frame = K latent`.
-    pub fn forward(&self, gpu: &Gpu, kernels: &BlurKernels, scratch: &Scratch, latent: &Channels, frame: &Channels) -> Vec<Step> {
+    /// Steps of `frame = K latent`, of one channel or three: as many as `scratch` is for.
+    pub fn forward(
+        &self,
+        gpu: &Gpu,
+        kernels: &BlurKernels,
+        scratch: &Scratch,
+        latent: &[wgpu::Buffer],
+        frame: &[wgpu::Buffer],
+    ) -> Vec<Step> {
+        let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();
         for from in (0..self.frame.1).step_by(cut.rows) {
@@ -524,10 +581,9 @@ impl Blur {
             let rows = self.forward_band(from, to);
             let copy_width = self.latent.0 + 2 * MARGIN;
             steps.push(self.copy(gpu, kernels, scratch, latent, self.latent, -(MARGIN as i32), copy_width, &rows));
-            let target = frame.each_ref().map(|b| gpu.rows(b, self.frame.0, from..to));
-            let out_first = (from - target[0].first) as i32;
-            let target = target.map(|b| b.binding);
-            let copy = scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
+            let (target, first_row) = scratch.rows(gpu, frame, self.frame, from..to, true);
+            let out_first = from as i32 - first_row;
+            let copy = scratch.whole(&scratch.copy, false);
             for (chunk, first, n) in self.passes(cut.bases) {
                 let (width, height) = (self.width(false), to - from + self.shifts().1);
                 let mut params = WarpParams {
@@ -556,8 +612,7 @@ impl Blur {
                     warp(&params, target.clone(), 1, first > 0);
                     continue;
                 };
-                let planes = || scratch.planes.each_ref().map(|b| b.as_entire_buffer_binding());
-                warp(&params, planes(), n, false);
+                warp(&params, scratch.whole(&scratch.planes, true), n, false);
                 let params = TapParams {
                     out_size: [self.frame.0 as i32, (to - from) as i32],
                     in_stride: width as i32,
@@ -567,7 +622,7 @@ impl Blur {
                     out_first,
                     _pad: 0,
                 };
-                let ([a, b, c], [x, y, z]) = (planes(), target.clone());
+                let ([a, b, c], [x, y, z]) = (scratch.whole(&scratch.planes, false), target.clone());
                 let parts = [chunk.forward.as_entire_buffer_binding(), a, b, c, x, y, z];
                 let groups = [self.frame.0.div_ceil(128) as u32, (to - from).div_ceil(8) as u32, 1];
                 steps.push(kernels.tap_sum[usize::from(first > 0)].step_parts(gpu, &params, &parts, groups));
@@ -576,16 +631,17 @@ impl Blur {
         steps
     }
 
-    /// Steps of `latent += factor Kᵀ frame`.
+    /// Steps of `latent += factor Kᵀ frame`, of one channel or three: as many as `scratch` is for.
     pub fn adjoint(
         &self,
         gpu: &Gpu,
         kernels: &BlurKernels,
         scratch: &Scratch,
-        frame: &Channels,
-        latent: &Channels,
+        frame: &[wgpu::Buffer],
+        latent: &[wgpu::Buffer],
         factor: f32,
     ) -> Vec<Step> {
+        let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();
         let copy_width = self.copy_width();
@@ -599,11 +655,9 @@ impl Blur {
             }
             let read = top + from as i32 + self.shift_y.0..top + to as i32 + self.shift_y.1;
             steps.push(self.copy(gpu, kernels, scratch, frame, self.frame, left + self.shift_x.0, copy_width, &read));
-            let target = latent.each_ref().map(|b| gpu.rows(b, self.latent.0, rows.start as usize..rows.end as usize));
-            let out_first = target[0].first as i32;
-            let target = target.map(|b| b.binding);
-            let copy = || scratch.copy.each_ref().map(|b| b.as_entire_buffer_binding());
-            let planes = || scratch.planes.each_ref().map(|b| b.as_entire_buffer_binding());
+            let (target, out_first) = scratch.rows(gpu, latent, self.latent, rows.start as usize..rows.end as usize, true);
+            let copy = || scratch.whole(&scratch.copy, false);
+            let planes = |output: bool| scratch.whole(&scratch.planes, output);
             for (chunk, first, n) in self.passes(cut.bases) {
                 let (width, height) = (self.width(true), to - from);
                 let mut params = WarpAdjointParams {
@@ -630,11 +684,11 @@ impl Blur {
                         out_first: 0,
                         _pad: 0,
                     };
-                    let ([a, b, c], [x, y, z]) = (copy(), planes());
+                    let ([a, b, c], [x, y, z]) = (copy(), planes(true));
                     let parts = [chunk.adjoint.as_entire_buffer_binding(), a, b, c, x, y, z];
                     let groups = [width.div_ceil(128) as u32, height.div_ceil(8) as u32, n as u32];
                     steps.push(kernels.tap_sum[0].step_parts(gpu, &params, &parts, groups));
-                    planes()
+                    planes(false)
                 } else {
                     params.in_size[0] = copy_width as i32;
                     params.plane = 0;

@@ -22,31 +22,52 @@ pub(super) const CG_DIRECTION: &str = include_str!("../../shaders/cg_direction.w
 pub(super) const CG_SCALARS: &str = include_str!("../../shaders/cg_scalars.wgsl");
 pub(super) const UPDATE: &str = include_str!("../../shaders/update.wgsl");
 
-/// Scalar ⟨r, z⟩.
-pub const SLOT_ENERGY: u32 = 0;
-/// Scalar ⟨p, A p⟩.
-pub const SLOT_CURVATURE: u32 = 1;
-/// Scalar: data term of the objective.
-pub const SLOT_DATA: u32 = 3;
+/// Scalar of a channel: ⟨r, z⟩.
+pub const SLOT_ENERGY: usize = 0;
+/// Scalar of a channel: ⟨p, A p⟩.
+pub const SLOT_CURVATURE: usize = 1;
+/// Scalar of a channel: data term of the objective.
+pub const SLOT_DATA: usize = 3;
+/// Scalars of a channel.
+pub const SLOTS: usize = 4;
 /// Scalar: smoothness term of the objective.
-pub const SLOT_SMOOTHNESS: u32 = 4;
+pub const SLOT_SMOOTHNESS: usize = 3 * SLOTS;
+/// Scalars in all.
+pub const SCALARS: usize = SLOT_SMOOTHNESS + 1;
+/// Rows above and below that the kernels of the smoothness term read.
+pub const HALO: usize = 1;
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct EdgeParams {
     size: [i32; 2],
-    lambda: f32,
-    epsilon: f32,
+    rows: [i32; 2],
+    first: i32,
     partial: u32,
     row: u32,
+    lambda: f32,
+    epsilon: f32,
+    _pad: f32,
 }
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct ImageParams {
+struct NormalParams {
     size: [i32; 2],
+    rows: [i32; 2],
+    first: i32,
     partial: u32,
     row: u32,
+    _pad: u32,
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct RightSideParams {
+    size: [i32; 2],
+    rows: [i32; 2],
+    first: i32,
+    _pad: u32,
 }
 
 #[repr(C)]
@@ -54,7 +75,8 @@ struct ImageParams {
 struct VectorParams {
     count: u32,
     row: u32,
-    _pad: [u32; 2],
+    scalars: u32,
+    _pad: u32,
 }
 
 #[repr(C)]
@@ -63,7 +85,7 @@ struct SumParams {
     count: u32,
     partial: u32,
     row: u32,
-    _pad: u32,
+    scalars: u32,
 }
 
 #[repr(C)]
@@ -81,19 +103,19 @@ struct UpdateParams {
     count: u32,
     row: u32,
     step: f32,
-    _pad: u32,
+    darkest: f32,
 }
 
 pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
-    let vector = size_of::<VectorParams>();
+    let (vector, sum) = (size_of::<VectorParams>(), size_of::<SumParams>());
     vec![
         ("edge_weight", size_of::<EdgeParams>()),
-        ("normal", size_of::<ImageParams>()),
-        ("right_side", size_of::<ImageParams>()),
+        ("normal", size_of::<NormalParams>()),
+        ("right_side", size_of::<RightSideParams>()),
         ("scale", vector),
         ("multiply", vector),
-        ("cg_start", size_of::<SumParams>()),
-        ("cg_step", size_of::<SumParams>()),
+        ("cg_start", sum),
+        ("cg_step", sum),
         ("cg_direction", vector),
         ("cg_scalars", size_of::<ScalarParams>()),
         ("update", size_of::<UpdateParams>()),
@@ -101,14 +123,106 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
 }
 
 /// Partial sums of a kernel over an image of `size`.
-pub fn partials_2d(size: (usize, usize)) -> usize {
-    size.0.div_ceil(16) * size.1.div_ceil(8)
+pub fn partials_2d(gpu: &Gpu, size: (usize, usize)) -> usize {
+    gpu.bands(size.1, HALO, size).map(|rows| size.0.div_ceil(16) * rows.len().div_ceil(8)).sum()
 }
 
 /// Partial sums of a kernel over `count` values.
-pub fn partials_1d(count: usize) -> usize {
+pub fn partials_1d(gpu: &Gpu, count: usize) -> usize {
+    gpu.parts(count, GROUP).map(|part| groups_1d(part.len())).sum()
+}
+
+fn groups_1d(count: usize) -> usize {
     let (row, rows) = grid_1d(count);
     row as usize * rows as usize
+}
+
+/// Values that a workgroup makes.
+const GROUP: usize = 128;
+
+/// A part of one vector for each of the kernel's bindings.
+pub(super) struct Part {
+    values: std::ops::Range<usize>,
+    /// First partial sum.
+    pub partial: u32,
+    /// Workgroups per row.
+    pub row: u32,
+}
+
+/// The parts in which `count` values can be bound, with partial sums from `partial` on.
+pub(super) fn parts(gpu: &Gpu, count: usize, partial: usize) -> Vec<Part> {
+    let mut next = partial;
+    let part = |values: std::ops::Range<usize>| {
+        let partial = next as u32;
+        next += groups_1d(values.len());
+        Part { partial, row: grid_1d(values.len()).0, values }
+    };
+    gpu.parts(count, GROUP).map(part).collect()
+}
+
+impl Part {
+    pub fn count(&self) -> u32 {
+        self.values.len() as u32
+    }
+
+    fn vector(&self, scalars: usize) -> VectorParams {
+        VectorParams { count: self.count(), row: self.row, scalars: scalars as u32, _pad: 0 }
+    }
+
+    fn sum(&self, scalars: usize) -> SumParams {
+        SumParams { count: self.count(), partial: self.partial, row: self.row, scalars: scalars as u32 }
+    }
+
+    /// A dispatch on this part of `vectors`, which stand between `before` and `after` among the bindings.
+    pub fn step<P: bytemuck::Pod>(
+        &self,
+        gpu: &Gpu,
+        kernel: &Kernel,
+        params: &P,
+        before: &[&wgpu::Buffer],
+        vectors: &[&wgpu::Buffer],
+        after: &[&wgpu::Buffer],
+    ) -> Step {
+        let mut bound: Vec<wgpu::BufferBinding> = before.iter().map(|b| b.as_entire_buffer_binding()).collect();
+        bound.extend(vectors.iter().map(|b| Gpu::part(b, &self.values)));
+        bound.extend(after.iter().map(|b| b.as_entire_buffer_binding()));
+        let (row, rows) = grid_1d(self.values.len());
+        kernel.step_parts(gpu, params, &bound, [row, rows, 1])
+    }
+}
+
+/// Some rows of planes of one size, which all are bound from the same row on.
+struct Band {
+    rows: std::ops::Range<usize>,
+    first: i32,
+    partial: u32,
+    groups: [u32; 3],
+}
+
+/// The bands in which planes of `size` can be bound, with partial sums from `partial` on.
+fn bands(gpu: &Gpu, size: (usize, usize), partial: usize) -> Vec<Band> {
+    let mut next = partial;
+    let band = |rows: std::ops::Range<usize>| {
+        let groups = [size.0.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1];
+        let partial = next as u32;
+        next += (groups[0] * groups[1]) as usize;
+        Band { rows, first: 0, partial, groups }
+    };
+    gpu.bands(size.1, HALO, size).map(band).collect()
+}
+
+impl Band {
+    /// Bindings of the band and its neighbours in `planes`; notes the row that comes first in them.
+    fn bind<'a>(&mut self, gpu: &Gpu, planes: &[&'a wgpu::Buffer], size: (usize, usize)) -> Vec<wgpu::BufferBinding<'a>> {
+        let seen = self.rows.start.saturating_sub(HALO)..(self.rows.end + HALO).min(size.1);
+        let bound: Vec<_> = planes.iter().map(|b| gpu.rows(b, size, seen.clone())).collect();
+        self.first = bound[0].first as i32;
+        bound.into_iter().map(|b| b.binding).collect()
+    }
+
+    fn rows(&self) -> [i32; 2] {
+        [self.rows.start as i32, self.rows.end as i32]
+    }
 }
 
 /// The compiled kernels.
@@ -123,18 +237,6 @@ pub struct LinearKernels {
     cg_direction: Kernel,
     cg_scalars: Kernel,
     update: Kernel,
-}
-
-fn image_params(size: (usize, usize), partial: usize) -> ImageParams {
-    ImageParams { size: [size.0 as i32, size.1 as i32], partial: partial as u32, row: size.0.div_ceil(16) as u32 }
-}
-
-fn vector_params(count: usize) -> VectorParams {
-    VectorParams { count: count as u32, row: grid_1d(count).0, _pad: [0; 2] }
-}
-
-fn sum_params(count: usize, partial: usize) -> SumParams {
-    SumParams { count: count as u32, partial: partial as u32, row: grid_1d(count).0, _pad: 0 }
 }
 
 impl LinearKernels {
@@ -155,19 +257,34 @@ impl LinearKernels {
         }
     }
 
-    /// `edge` = half-quadratic weights of total variation of the three planes `log`; smoothness term as partial sums.
+    /// `edge` = half-quadratic weights of total variation of the logarithm of the three planes `irradiance`; smoothness term as partial sums.
     pub fn edge_weight(
         &self,
         gpu: &Gpu,
-        log: &super::Channels,
+        irradiance: &super::Channels,
         edge: &wgpu::Buffer,
         partials: &wgpu::Buffer,
         lambda: f32,
         epsilon: f32,
         size: (usize, usize),
-    ) -> Step {
-        let params = EdgeParams { size: [size.0 as i32, size.1 as i32], lambda, epsilon, partial: 0, row: size.0.div_ceil(16) as u32 };
-        self.edge_weight.step_2d(gpu, &params, &[&log[0], &log[1], &log[2], edge, partials], size, 1)
+    ) -> Vec<Step> {
+        let [r, g, b] = irradiance;
+        let step = |mut band: Band| {
+            let mut bound = band.bind(gpu, &[r, g, b, edge], size);
+            bound.push(partials.as_entire_buffer_binding());
+            let params = EdgeParams {
+                size: [size.0 as i32, size.1 as i32],
+                rows: band.rows(),
+                first: band.first,
+                partial: band.partial,
+                row: band.groups[0],
+                lambda,
+                epsilon,
+                _pad: 0.0,
+            };
+            self.edge_weight.step_parts(gpu, &params, &bound, band.groups)
+        };
+        bands(gpu, size, 0).into_iter().map(step).collect()
     }
 
     /// `product` = E `back` + Dᵀ w D `direction`; ⟨direction, product⟩ as partial sums.
@@ -182,8 +299,21 @@ impl LinearKernels {
         partials: &wgpu::Buffer,
         partial: usize,
         size: (usize, usize),
-    ) -> Step {
-        self.normal.step_2d(gpu, &image_params(size, partial), &[irradiance, back, edge, direction, product, partials], size, 1)
+    ) -> Vec<Step> {
+        let step = |mut band: Band| {
+            let mut bound = band.bind(gpu, &[irradiance, back, edge, direction, product], size);
+            bound.push(partials.as_entire_buffer_binding());
+            let params = NormalParams {
+                size: [size.0 as i32, size.1 as i32],
+                rows: band.rows(),
+                first: band.first,
+                partial: band.partial,
+                row: band.groups[0],
+                _pad: 0,
+            };
+            self.normal.step_parts(gpu, &params, &bound, band.groups)
+        };
+        bands(gpu, size, partial).into_iter().map(step).collect()
     }
 
     /// `right_side` = E `back` - Dᵀ w D u, and the Jacobi preconditioner.
@@ -193,14 +323,17 @@ impl LinearKernels {
         irradiance: &wgpu::Buffer,
         back: &wgpu::Buffer,
         edge: &wgpu::Buffer,
-        log: &wgpu::Buffer,
         data_diagonal: &wgpu::Buffer,
         right_side: &wgpu::Buffer,
         diagonal: &wgpu::Buffer,
         size: (usize, usize),
-    ) -> Step {
-        let buffers = [irradiance, back, edge, log, data_diagonal, right_side, diagonal];
-        self.right_side.step_2d(gpu, &image_params(size, 0), &buffers, size, 1)
+    ) -> Vec<Step> {
+        let step = |mut band: Band| {
+            let bound = band.bind(gpu, &[irradiance, back, edge, data_diagonal, right_side, diagonal], size);
+            let params = RightSideParams { size: [size.0 as i32, size.1 as i32], rows: band.rows(), first: band.first, _pad: 0 };
+            self.right_side.step_parts(gpu, &params, &bound, band.groups)
+        };
+        bands(gpu, size, 0).into_iter().map(step).collect()
     }
 
     /// `scaled` = E `direction`, `back` = `weight` `scaled`.
@@ -213,13 +346,14 @@ impl LinearKernels {
         scaled: &wgpu::Buffer,
         back: &wgpu::Buffer,
         count: usize,
-    ) -> Step {
-        self.scale.step_1d(gpu, &vector_params(count), &[irradiance, direction, weight, scaled, back], count)
+    ) -> Vec<Step> {
+        let vectors = [irradiance, direction, weight, scaled, back];
+        parts(gpu, count, 0).iter().map(|p| p.step(gpu, &self.scale, &p.vector(0), &[], &vectors, &[])).collect()
     }
 
     /// `values` *= `factors`.
-    pub fn multiply(&self, gpu: &Gpu, factors: &wgpu::Buffer, values: &wgpu::Buffer, count: usize) -> Step {
-        self.multiply.step_1d(gpu, &vector_params(count), &[factors, values], count)
+    pub fn multiply(&self, gpu: &Gpu, factors: &wgpu::Buffer, values: &wgpu::Buffer, count: usize) -> Vec<Step> {
+        parts(gpu, count, 0).iter().map(|p| p.step(gpu, &self.multiply, &p.vector(0), &[], &[factors, values], &[])).collect()
     }
 
     /// x = 0, p = r / diagonal; ⟨r, p⟩ as partial sums.
@@ -233,15 +367,17 @@ impl LinearKernels {
         partials: &wgpu::Buffer,
         partial: usize,
         count: usize,
-    ) -> Step {
-        self.cg_start.step_1d(gpu, &sum_params(count, partial), &[residual, diagonal, solution, direction, partials], count)
+    ) -> Vec<Step> {
+        let vectors = [residual, diagonal, solution, direction];
+        parts(gpu, count, partial).iter().map(|p| p.step(gpu, &self.cg_start, &p.sum(0), &[], &vectors, &[partials])).collect()
     }
 
-    /// x += α p, r -= α q; ⟨r, r / diagonal⟩ as partial sums.
+    /// x += α p, r -= α q of `channel`; ⟨r, r / diagonal⟩ as partial sums.
     pub fn cg_step(
         &self,
         gpu: &Gpu,
         scalars: &wgpu::Buffer,
+        channel: usize,
         direction: &wgpu::Buffer,
         product: &wgpu::Buffer,
         diagonal: &wgpu::Buffer,
@@ -250,42 +386,55 @@ impl LinearKernels {
         partials: &wgpu::Buffer,
         partial: usize,
         count: usize,
-    ) -> Step {
-        let buffers = [scalars, direction, product, diagonal, solution, residual, partials];
-        self.cg_step.step_1d(gpu, &sum_params(count, partial), &buffers, count)
+    ) -> Vec<Step> {
+        let vectors = [direction, product, diagonal, solution, residual];
+        let step = |p: &Part| p.step(gpu, &self.cg_step, &p.sum(SLOTS * channel), &[scalars], &vectors, &[partials]);
+        parts(gpu, count, partial).iter().map(step).collect()
     }
 
-    /// p = r / diagonal + β p.
+    /// p = r / diagonal + β p of `channel`.
     pub fn cg_direction(
         &self,
         gpu: &Gpu,
         scalars: &wgpu::Buffer,
+        channel: usize,
         residual: &wgpu::Buffer,
         diagonal: &wgpu::Buffer,
         direction: &wgpu::Buffer,
         count: usize,
+    ) -> Vec<Step> {
+        let vectors = [residual, diagonal, direction];
+        let step = |p: &Part| p.step(gpu, &self.cg_direction, &p.vector(SLOTS * channel), &[scalars], &vectors, &[]);
+        parts(gpu, count, 0).iter().map(step).collect()
+    }
+
+    /// Scalar `slot` of each of `channels` = sum of `count` partial sums, one channel's after another's; `shift` keeps the old ⟨r, z⟩ for β.
+    pub fn sum(
+        &self,
+        gpu: &Gpu,
+        partials: &wgpu::Buffer,
+        scalars: &wgpu::Buffer,
+        channels: std::ops::Range<usize>,
+        count: usize,
+        slot: usize,
+        shift: bool,
     ) -> Step {
-        self.cg_direction.step_1d(gpu, &vector_params(count), &[scalars, residual, diagonal, direction], count)
+        let params = ScalarParams { first: 0, count: count as u32, slot: (slot + SLOTS * channels.start) as u32, shift: u32::from(shift) };
+        self.cg_scalars.step(gpu, &params, &[partials, scalars], [channels.len() as u32, 1, 1])
     }
 
-    /// `scalars[slot]` = sum of the first `count` partial sums; `shift` keeps the old ⟨r, z⟩ for β.
-    pub fn sum(&self, gpu: &Gpu, partials: &wgpu::Buffer, scalars: &wgpu::Buffer, count: usize, slot: u32, shift: bool) -> Step {
-        let params = ScalarParams { first: 0, count: count as u32, slot, shift: u32::from(shift) };
-        self.cg_scalars.step(gpu, &params, &[partials, scalars], [1, 1, 1])
-    }
-
-    /// E = exp(`old`) · (1 + x) where x = `step` · `solution` is positive (at most fourfold), · exp(x) elsewhere (at least 1 / e); u = ln E.
+    /// E = `old` · (1 + x) where x = `step` · `solution` is positive (at most fourfold), · exp(x) elsewhere (at least 1 / e), never below `darkest`.
     pub fn update(
         &self,
         gpu: &Gpu,
         old: &wgpu::Buffer,
         solution: &wgpu::Buffer,
-        log: &wgpu::Buffer,
         irradiance: &wgpu::Buffer,
         step: f32,
+        darkest: f32,
         count: usize,
-    ) -> Step {
-        let params = UpdateParams { count: count as u32, row: grid_1d(count).0, step, _pad: 0 };
-        self.update.step_1d(gpu, &params, &[old, solution, log, irradiance], count)
+    ) -> Vec<Step> {
+        let params = |p: &Part| UpdateParams { count: p.count(), row: p.row, step, darkest };
+        parts(gpu, count, 0).iter().map(|p| p.step(gpu, &self.update, &params(p), &[], &[old, solution, irradiance], &[])).collect()
     }
 }

@@ -6,13 +6,12 @@ mod display;
 mod linear;
 
 pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
-pub use data::{DataKernels, MisfitSource, NOISE_STEPS, WeightTarget};
+pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, WeightTarget};
 pub use display::{Display, DisplayParams, Place};
-pub use linear::{LinearKernels, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, partials_1d, partials_2d};
+pub use linear::{HALO, LinearKernels, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, partials_1d, partials_2d};
 
 use crate::gpu::Gpu;
 use crate::tsf::Interpolation;
-use std::sync::OnceLock;
 
 /// Three buffers of one size: red, green, blue.
 pub type Channels = [wgpu::Buffer; 3];
@@ -32,7 +31,7 @@ pub const STILL: Interpolation = Interpolation::SixPoint;
 /// All kernels, compiled once per device.
 pub struct Kernels {
     /// K and Kᵀ, by the half-width of the interpolation.
-    blur: [OnceLock<BlurKernels>; 3],
+    blur: [BlurKernels; 3],
     /// Data weights and residuals.
     pub data: DataKernels,
     /// Smoothness and conjugate gradients.
@@ -42,12 +41,13 @@ pub struct Kernels {
 impl Kernels {
     /// Compiles everything but K and Kᵀ.
     pub fn new(gpu: &Gpu) -> Self {
-        Self { blur: [const { OnceLock::new() }; 3], data: DataKernels::new(gpu), linear: LinearKernels::new(gpu) }
+        let blur = [Interpolation::Bilinear, Interpolation::Bicubic, Interpolation::SixPoint].map(BlurKernels::new);
+        Self { blur, data: DataKernels::new(gpu), linear: LinearKernels::new(gpu) }
     }
 
-    /// K and Kᵀ under `interpolation`, compiled when first asked for.
-    pub fn blur(&self, gpu: &Gpu, interpolation: Interpolation) -> &BlurKernels {
-        self.blur[interpolation.support() - 1].get_or_init(|| BlurKernels::new(gpu, interpolation))
+    /// K and Kᵀ under `interpolation`.
+    pub fn blur(&self, interpolation: Interpolation) -> &BlurKernels {
+        &self.blur[interpolation.support() - 1]
     }
 }
 

@@ -88,7 +88,7 @@ impl Case {
             pad,
             interpolation,
             matrix: blur::of_taps(&taps, interpolation, frame, pad),
-            blur: Blur::new(gpu(), kernels().blur(gpu(), interpolation), &taps, frame, pad),
+            blur: Blur::new(gpu(), kernels().blur(interpolation), &taps, frame, pad),
             tolerance: tolerance(&taps, frame, interpolation.support()),
         }
     }
@@ -97,21 +97,30 @@ impl Case {
         ((self.frame.0 + 2 * self.pad) * (self.frame.1 + 2 * self.pad), self.frame.0 * self.frame.1)
     }
 
-    fn scratch(&self, size: ScratchSize) -> Scratch {
-        Scratch::new(gpu(), size).expect("fits")
+    /// [`Case::check`] of three channels at a time and of one.
+    fn check_with(&self, size: ScratchSize) {
+        for channels in [3, 1] {
+            self.check(&Scratch::new(gpu(), size, channels).expect("fits"));
+        }
     }
 
     fn forward(&self, scratch: &Scratch, latent: &Channels) -> [Vec<f32>; 3] {
         let m = self.counts().1;
         let out = [poisoned(m), poisoned(m), poisoned(m)];
-        run(&self.blur.forward(gpu(), kernels().blur(gpu(), self.interpolation), scratch, latent, &out));
+        let kernels = kernels().blur(self.interpolation);
+        for (latent, out) in latent.chunks(scratch.channels()).zip(out.chunks(scratch.channels())) {
+            run(&self.blur.forward(gpu(), kernels, scratch, latent, out));
+        }
         out.map(|o| read(&o, m))
     }
 
     /// `start + factor Kᵀ frame`.
     fn adjoint(&self, scratch: &Scratch, frame: &Channels, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
         let out = planes(start);
-        run(&self.blur.adjoint(gpu(), kernels().blur(gpu(), self.interpolation), scratch, frame, &out, factor));
+        let kernels = kernels().blur(self.interpolation);
+        for (frame, out) in frame.chunks(scratch.channels()).zip(out.chunks(scratch.channels())) {
+            run(&self.blur.adjoint(gpu(), kernels, scratch, frame, out, factor));
+        }
         out.map(|o| read(&o, self.counts().0))
     }
 
@@ -158,7 +167,7 @@ fn check_all(interpolation: Interpolation) {
                 for case in [Case::new, Case::direct].map(|c| c(name, &tsf, frame, pad, interpolation)) {
                     // More than the operator asks for: what lies beyond must not be read.
                     let wanted = case.blur.scratch_wanted();
-                    case.check(&case.scratch(ScratchSize { planes: wanted.planes + 1, copy: wanted.copy + 1 }));
+                    case.check_with(ScratchSize { planes: wanted.planes + 1, copy: wanted.copy + 1 });
                 }
             }
         }
@@ -185,7 +194,7 @@ fn a_frame_six_thousand_pixels_wide_keeps_its_precision() {
     let poses = vec![Pose::planar(0.3, -0.2, 0.15, 0.6), Pose::planar(2.8, 0.4, 0.16, 0.4)];
     for new in [Case::new, Case::direct] {
         let case = new("wide", &Tsf::new(7000.0, poses.clone()).expect("valid"), (6001, 3), 12, Interpolation::Bicubic);
-        case.check(&case.scratch(case.blur.scratch_wanted()));
+        case.check_with(case.blur.scratch_wanted());
     }
 }
 
@@ -193,13 +202,13 @@ fn a_frame_six_thousand_pixels_wide_keeps_its_precision() {
 fn several_passes_equal_one() {
     for (name, tsf) in motions(33).into_iter().filter(|m| ["rotations", "pitch and yaw", "partly beyond the frame"].contains(&m.0)) {
         let direct = Case::direct(name, &tsf, (33, 21), 4, Interpolation::Bicubic);
-        direct.check(&direct.scratch(direct.blur.scratch_needed()));
+        direct.check_with(direct.blur.scratch_needed());
         let case = Case::new(name, &tsf, (33, 21), 4, Interpolation::Bicubic);
         let (least, wanted) = (case.blur.scratch_needed(), case.blur.scratch_wanted());
         assert!(wanted.planes > 3 * least.planes && wanted.copy > least.copy, "{name}: {wanted:?} {least:?}");
         for planes in [least.planes, least.planes + 1, 3 * least.planes, wanted.planes / 2, wanted.planes - 1] {
             for copy in [least.copy, wanted.copy] {
-                case.check(&case.scratch(ScratchSize { planes, copy }));
+                case.check_with(ScratchSize { planes, copy });
             }
         }
     }
@@ -207,7 +216,7 @@ fn several_passes_equal_one() {
 
 #[test]
 fn scratch_is_shared_without_traces() {
-    let scratch = Scratch::new(gpu(), ScratchSize { planes: 40 * 60 * 110, copy: 300 * 200 }).expect("fits");
+    let scratch = Scratch::new(gpu(), ScratchSize { planes: 40 * 60 * 110, copy: 300 * 200 }, 3).expect("fits");
     for round in 0..2 {
         for (name, tsf) in motions(33).iter().take(7) {
             let case = Case::new(&format!("round {round}, {name}"), tsf, (33, 21), 4, Interpolation::Bicubic);
@@ -407,9 +416,9 @@ fn planes_larger_than_a_binding_are_bound_in_bands() {
     assert!(m > gpu.max_binding());
     let tsf = Tsf::new(500.0, vec![Pose::planar(0.4, -0.3, -0.4, 0.6), Pose::planar(2.2, 3.8, 0.5, 0.4)]).expect("valid");
     for taps in [TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear), TapSet::direct(&tsf, frame.0, frame.1)] {
-        let blur = Blur::new(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &taps, frame, pad);
+        let blur = Blur::new(&gpu, kernels.blur(Interpolation::Bilinear), &taps, frame, pad);
         let most = ScratchSize { planes: gpu.max_binding(), copy: gpu.max_binding() };
-        let scratch = Scratch::new(&gpu, blur.scratch_wanted().min(most)).expect("fits");
+        let scratch = Scratch::new(&gpu, blur.scratch_wanted().min(most), 3).expect("fits");
         let upload = |seed: u64, count: usize| -> ([Vec<f32>; 3], Channels) {
             let values = [noise(seed, count), noise(seed + 1, count), noise(seed + 2, count)];
             let buffers = values.each_ref().map(|v| gpu.upload("test", v).expect("fits"));
@@ -417,8 +426,8 @@ fn planes_larger_than_a_binding_are_bound_in_bands() {
         };
         let ((latent, e), (seen, b)) = (upload(1, n), upload(4, m));
         let ((_, out), (start, back)) = (upload(7, m), upload(10, n));
-        gpu.submit(&blur.forward(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &e, &out));
-        gpu.submit(&blur.adjoint(&gpu, kernels.blur(&gpu, Interpolation::Bilinear), &scratch, &b, &back, 1.0));
+        gpu.submit(&blur.forward(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &e, &out));
+        gpu.submit(&blur.adjoint(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &b, &back, 1.0));
         let matrix = blur::of_taps(&taps, Interpolation::Bilinear, frame, pad);
         let bound = tolerance(&taps, frame, 1);
         for c in 0..3 {
@@ -438,12 +447,12 @@ fn a_frame_twelve_thousand_pixels_wide_runs_in_one_piece_and_in_bands() {
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
     let tsf = Tsf::new(9000.0, vec![Pose::planar(0.3, -0.2, 0.02, 0.5), Pose::planar(2.3, 3.4, 0.0, 0.5)]).expect("valid");
     let taps = TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear);
-    let kernels = kernels().blur(gpu(), Interpolation::Bilinear);
+    let kernels = kernels().blur(Interpolation::Bilinear);
     let blur = Blur::new(gpu(), kernels, &taps, frame, pad);
     let (latent, seen) = (planes(&[1, 2, 3].map(|s| noise(s, n))), planes(&[4, 5, 6].map(|s| noise(s, m))));
     let (least, wanted) = (blur.scratch_needed(), blur.scratch_wanted());
     let results = [wanted, ScratchSize { planes: wanted.planes / 7, copy: (wanted.copy / 2).max(least.copy) }].map(|size| {
-        let scratch = Scratch::new(gpu(), size).expect("fits");
+        let scratch = Scratch::new(gpu(), size, 3).expect("fits");
         let (out, back) = ([poisoned(m), poisoned(m), poisoned(m)], planes(&[7, 8, 9].map(|s| noise(s, n))));
         let (forward, adjoint) =
             (blur.forward(gpu(), kernels, &scratch, &latent, &out), blur.adjoint(gpu(), kernels, &scratch, &seen, &back, 1.0));

@@ -2,7 +2,7 @@
 
 use crate::support::{files, gpu::gpu, gpu::kernels, noise};
 use std::collections::BTreeMap;
-use unshaken::deblur::{Observation, Settings, Solution, solve};
+use unshaken::deblur::{self, Observation, Settings, Solution, pad_for, solve};
 use unshaken::error::Error;
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::gpu::Gpu;
@@ -58,17 +58,19 @@ fn less_memory_gives_the_same_irradiance() {
     let kernels = Kernels::new(&gpu);
     let all = run(&gpu, &kernels, None).expect("solves");
     let memory = all.report.memory;
-    assert!(!memory.streamed && !memory.reduced);
+    assert!(!memory.streamed && !memory.reduced && memory.channels_together == 3);
     // What was planned is what was made.
     assert_eq!(gpu.counted(), memory.bytes);
     let (n, m) = ((SIZE.0 + 2 * PAD) * (SIZE.1 + 2 * PAD), SIZE.0 * SIZE.1);
-    let stated = (124 * n + (16 + 3 * 16 + 12 + 24) * m) as u64;
+    let stated = (112 * n + (3 * 16 + 12 + 24) * m) as u64;
+    let least = (72 * n + (4 + 24) * m) as u64;
     assert!(memory.bytes > stated && memory.bytes < stated + stated / 2, "{} for {stated} without scratch", memory.bytes);
 
-    for (limit, streamed) in [(memory.bytes - 300_000, false), (stated - 100_000, true)] {
+    for (limit, streamed, together) in [(memory.bytes - 300_000, false, 3), (stated - 100_000, true, 3), (least + least / 8, true, 1)] {
         let less = run(&gpu, &kernels, Some(limit)).expect("solves");
-        assert_eq!(less.report.memory.streamed, streamed, "{limit} of {}", memory.bytes);
-        assert!(less.report.memory.bytes <= limit && gpu.counted() == less.report.memory.bytes);
+        let how = less.report.memory;
+        assert_eq!((how.streamed, how.channels_together), (streamed, together), "{limit} of {}", memory.bytes);
+        assert!(how.bytes <= limit && gpu.counted() == how.bytes);
         assert!(farthest(&all.irradiance, &less.irradiance) < 1e-5, "{}", farthest(&all.irradiance, &less.irradiance));
         for (a, b) in all.misfit.iter().zip(&less.misfit) {
             assert!(a.data.iter().zip(&b.data).all(|(a, b)| (a - b).abs() <= 1e-3 * (1.0 + a.abs())));
@@ -76,6 +78,33 @@ fn less_memory_gives_the_same_irradiance() {
     }
     let error = run(&gpu, &kernels, Some(1 << 20)).err().expect("too little").to_string();
     assert!(error.contains("MiB") && error.contains("--memory-limit") && error.contains("--scale"), "{error}");
+}
+
+/// By the plan that `less_memory_gives_the_same_irradiance` holds against what is made.
+#[test]
+fn large_brackets_fit_the_memory_that_there_is() {
+    // A path of 60 px and 0.3 degrees of roll, as a frame of 6000 pixels sees what is 4 px in one of 400.
+    let at = |i: usize, size: (usize, usize)| {
+        let t = i as f64 / 120.0;
+        Pose::planar(0.01 * size.0 as f64 * t, 0.004 * size.0 as f64 * (3.0 * t).sin(), 0.3 * t, 1.0)
+    };
+    let memory = |size: (usize, usize), shaken: usize, limit: u64| {
+        let path = Tsf::new(1.2 * size.0 as f64, (0..120).map(|i| at(i, size)).collect()).expect("valid");
+        let sharp = Tsf::identity();
+        let tsfs: Vec<&Tsf> = (0..5).map(|i| if i < shaken { &path } else { &sharp }).collect();
+        let pad = pad_for(&tsfs, size.0, size.1, size.0 / 4);
+        let settings = Settings { memory_limit: Some(limit), ..Settings::default() };
+        deblur::memory(gpu(), kernels(), &tsfs, size, pad, &settings)
+    };
+    let (small, large) = ((6000, 4000), (9000, 6667));
+    for (size, shaken, limit) in [(small, 2, 4_000_000_000), (small, 3, 4_000_000_000), (large, 2, 8_000_000_000)] {
+        let planned = memory(size, shaken, limit).expect("fits");
+        assert!(planned.bytes <= limit && planned.streamed, "{planned:?}");
+    }
+    // With more of it everything stays on the device.
+    let roomy = memory(small, 2, 16_000_000_000).expect("fits");
+    assert!(!roomy.streamed && roomy.channels_together == 3 && roomy.bytes > 4_000_000_000, "{roomy:?}");
+    assert!(matches!(memory(small, 2, 2_000_000_000), Err(Error::OutOfMemory(_))));
 }
 
 #[test]
@@ -90,11 +119,24 @@ fn a_device_that_runs_out_of_memory_is_asked_for_less() {
     assert!(matches!(run(&tiny, &kernels, None), Err(Error::OutOfMemory(_))));
 }
 
+/// A bracket whose planes no binding holds is solved in bands, whether exposures stay on the host or not; below the rows that an operator
+/// reads at once it is refused.
 #[test]
-fn frames_beyond_a_binding_are_refused_with_a_remedy() {
-    let narrow = Gpu::new().expect("an adapter").with_binding_limit(100_000);
+fn frames_beyond_a_binding_are_solved_in_bands() {
+    let all = run(gpu(), kernels(), None).expect("solves");
+    let narrow = Gpu::new().expect("an adapter").with_binding_limit(60_000);
     let kernels = Kernels::new(&narrow);
-    let error = run(&narrow, &kernels, None).err().expect("too large").to_string();
+    assert!(narrow.max_binding() < SIZE.0 * SIZE.1);
+    for limit in [None, Some(all.report.memory.bytes * 3 / 4)] {
+        let bands = run(&narrow, &kernels, limit).expect("solves");
+        assert!(farthest(&all.irradiance, &bands.irradiance) < 1e-5, "{}", farthest(&all.irradiance, &bands.irradiance));
+        for (a, b) in all.misfit.iter().zip(&bands.misfit) {
+            assert!(a.data.iter().zip(&b.data).all(|(a, b)| (a - b).abs() <= 1e-3 * (1.0 + a.abs())));
+        }
+    }
+    let narrower = Gpu::new().expect("an adapter").with_binding_limit(20_000);
+    let kernels = Kernels::new(&narrower);
+    let error = run(&narrower, &kernels, None).err().expect("too large").to_string();
     assert!(error.contains("150 x 110") && error.contains("--scale"), "{error}");
 }
 
