@@ -1,30 +1,24 @@
-// An irradiance image on the screen: exposure, tone curve, split, overlays.
+// A picture on the screen: exposure, tone curve, overlays.
 //
-// One fragment is one pixel of the screen. Where it lies in the frame follows from pan and zoom; what lies there is read straight from
-// the planes that the solver works on (f32 storage buffers, one per channel), so that nothing is copied for display. Left of the divider
-// picture A is shown, right of it picture B. The curve c and the colours are those of `tonemap::Operator::apply`, value for value:
+// One fragment is one pixel of the screen. Where it lies in the frame follows from pan and zoom; what lies there is sampled from the
+// picture (picture.wgsl) and its smaller copies. The curve c and the colours are those of `tonemap::Operator::apply`, value for value:
 // luminance Y shows as c(gain Y), colours keep their ratios to Y and pale where the screen cannot hold them.
 
-struct Picture {
-    size: vec2u,     // pixels of the picture, without pad; 0: none
-    stride: u32,     // values per row of the planes
-    first: u32,      // index of the picture's first value
+struct Overlay {
+    size: vec2u,     // pixels of the overlay, without pad
+    stride: u32,     // values per row of the plane
+    first: u32,      // index of the overlay's first value
 }
 
 struct Params {
-    matrix: array<vec4f, 3>, // columns: the frames' RGB to Rec. 709
-    origin: vec2f,   // pixel of the screen at the view's corner
-    pan: vec2f,      // point of the frame there, pixels of the full frame
+    pan: vec2f,      // point of the frame at the view's corner, pixels of the full frame
     frame: vec2f,    // full frame, pixels
     per_pixel: f32,  // pixels of the frame per pixel of the screen
-    split: f32,      // divider, pixels of the screen from the view's corner
     gain: f32,
     white: f32,
     saturation: f32,
-    filmic: u32,
-    a: Picture,
-    b: Picture,
-    overlay: Picture,
+    overlay: Overlay,
+    curve: u32,        // 0 Reinhard, 1 filmic, 2 none: the picture is toned
     overlay_kind: u32, // 0 none, 1 mask, 2 residual, 3 clipped
     extremes: u32,     // 1: show what the curve makes white or black
     encoded: u32,      // 1: the target takes sRGB codes; 0: it encodes by itself
@@ -32,60 +26,31 @@ struct Params {
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> a_red: array<f32>;
-@group(0) @binding(2) var<storage, read> a_green: array<f32>;
-@group(0) @binding(3) var<storage, read> a_blue: array<f32>;
-@group(0) @binding(4) var<storage, read> b_red: array<f32>;
-@group(0) @binding(5) var<storage, read> b_green: array<f32>;
-@group(0) @binding(6) var<storage, read> b_blue: array<f32>;
-@group(0) @binding(7) var<storage, read> overlay: array<f32>;
+@group(0) @binding(1) var picture: texture_2d<f32>;
+@group(0) @binding(2) var<storage, read> overlay: array<f32>;
 
-@vertex
-fn corners(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
-    // One triangle that covers the view.
-    return vec4f(f32(i32(i & 1u) * 4 - 1), f32(i32(i >> 1u) * 4 - 1), 0.0, 1.0);
-}
-
-fn value(left: bool, p: vec2i) -> vec3f {
-    var picture = params.b;
-    if left {
-        picture = params.a;
-    }
-    let q = vec2u(clamp(p, vec2i(0), vec2i(picture.size) - 1));
-    let i = picture.first + q.y * picture.stride + q.x;
-    if left {
-        return vec3f(a_red[i], a_green[i], a_blue[i]);
-    }
-    return vec3f(b_red[i], b_green[i], b_blue[i]);
-}
-
-// Irradiance at `q` (pixels of the frame, the first centre at 0.5): the mean where the screen is coarser than the picture, the pixel where
+// Light at `q` (pixels of the frame, the first centre at 0.5): the mean where the screen is coarser than the picture, the pixel where
 // it is finer, between pixels where the picture is a reduced one.
-fn irradiance(left: bool, q: vec2f) -> vec3f {
-    let size = vec2f(select(params.b.size, params.a.size, left));
-    let scale = size / params.frame;
+fn light(q: vec2f) -> vec3f {
+    let scale = vec2f(textureDimensions(picture)) / params.frame;
     let step = params.per_pixel * scale.x;
-    let p = q * scale;
-    if step > 1.001 {
-        let n = i32(min(ceil(step), 4.0));
-        var sum = vec3f(0.0);
-        for (var j = 0; j < n; j++) {
-            for (var i = 0; i < n; i++) {
-                let at = p + step * ((vec2f(f32(i), f32(j)) + 0.5) / f32(n) - 0.5);
-                sum += value(left, vec2i(floor(at)));
-            }
-        }
-        return sum / f32(n * n);
+    // Of the smaller copy that is still finer than the screen, but no more than twice, the texels in the quarters of the fragment.
+    let level = clamp(i32(ceil(log2(step * 0.999))) - 1, 0, i32(textureNumLevels(picture)) - 1);
+    let shrunk = exp2(-f32(level));
+    let p = q * scale * shrunk;
+    var reach = 0.25 * step * shrunk;
+    var part = vec2f(0.5);
+    if step <= 1.001 {
+        let reduced = scale.x <= 0.99;
+        reach = select(0.0, 0.5, reduced);
+        part = fract(p - 0.5);
     }
-    if scale.x > 0.99 {
-        return value(left, vec2i(floor(p)));
-    }
-    let c = p - 0.5;
-    let f = fract(c);
-    let i = vec2i(floor(c));
-    let upper = mix(value(left, i), value(left, i + vec2i(1, 0)), f.x);
-    let lower = mix(value(left, i + vec2i(0, 1)), value(left, i + vec2i(1, 1)), f.x);
-    return mix(upper, lower, f.y);
+    let last = vec2i(textureDimensions(picture, level)) - 1;
+    let a = clamp(vec2i(floor(p - reach)), vec2i(0), last);
+    let b = clamp(vec2i(floor(p + reach)), vec2i(0), last);
+    let upper = mix(textureLoad(picture, a, level), textureLoad(picture, vec2i(b.x, a.y), level), part.x);
+    let lower = mix(textureLoad(picture, vec2i(a.x, b.y), level), textureLoad(picture, b, level), part.x);
+    return mix(upper, lower, part.y).rgb;
 }
 
 fn hable(x: f32) -> f32 {
@@ -93,8 +58,11 @@ fn hable(x: f32) -> f32 {
 }
 
 fn shown(luminance: f32) -> f32 {
+    if params.curve == 2u {
+        return luminance;
+    }
     let v = min(luminance * params.gain, 1e12);
-    if params.filmic == 1u {
+    if params.curve == 1u {
         return hable(2.0 * min(v, params.white)) / hable(2.0 * params.white);
     }
     return v * (1.0 + v / (params.white * params.white)) / (1.0 + v);
@@ -111,7 +79,7 @@ fn decode(v: vec3f) -> vec3f {
 
 // Linear Rec. 709 for the screen, 1 is white; w is 1 where the curve ends at white, -1 where it ends at black.
 fn tone(linear: vec3f) -> vec4f {
-    let own = max(params.matrix[0].xyz * linear.r + params.matrix[1].xyz * linear.g + params.matrix[2].xyz * linear.b, vec3f(0.0));
+    let own = max(linear, vec3f(0.0));
     let y = dot(own, vec3f(0.2126, 0.7152, 0.0722));
     let s = shown(y);
     if !(y > 0.0 && s > 0.0) {
@@ -148,13 +116,11 @@ fn heat(t: f32) -> vec3f {
 
 @fragment
 fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
-    let at = position.xy - params.origin;
+    let at = position.xy;
     let q = params.pan + at * params.per_pixel;
-    let left = at.x < params.split;
-    let size = select(params.b.size, params.a.size, left);
     var code = vec3f(params.background);
-    if all(q >= vec2f(0.0)) && all(q < params.frame) && size.x > 0u {
-        let toned = tone(irradiance(left, q));
+    if all(q >= vec2f(0.0)) && all(q < params.frame) {
+        let toned = tone(light(q));
         code = encode(toned.xyz);
         if params.extremes == 1u && toned.w > 0.5 {
             code = vec3f(0.9, 0.1, 0.1);
@@ -162,7 +128,7 @@ fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
         if params.extremes == 1u && toned.w < -0.5 {
             code = vec3f(0.15, 0.3, 0.95);
         }
-        if params.overlay_kind > 0u && params.overlay.size.x > 0u {
+        if params.overlay_kind > 0u {
             let o = params.overlay;
             let p = vec2u(clamp(floor(q * vec2f(o.size) / params.frame), vec2f(0.0), vec2f(o.size) - 1.0));
             let v = overlay[o.first + p.y * o.stride + p.x];

@@ -1,12 +1,12 @@
 //! The window's state, and what its parts do to it.
 
-use super::canvas::{self, Shown, View};
+use super::canvas::{self, Canvas, Shown, Side, View};
 use super::device::Device;
 use super::session::{History, Recent, Session, Shot};
 use super::shortcuts::{self, Action};
 use super::worker::{Failure, News, Overlay, OverlayKey, OverlayKind, Picture, Ready, Request, Solved, Thumbnail, Workers};
 use super::{Chosen, Options, Program, blur, controls, export, strip, words};
-use crate::kernels::{Display, DisplayParams, Place};
+use crate::kernels::{DisplayParams, Place};
 use crate::pipeline::Estimate;
 use crate::tonemap::{Light, Operator};
 use egui::{Color32, RichText, Vec2};
@@ -192,6 +192,8 @@ pub struct App {
     pub(super) ready: Option<Arc<Ready>>,
     pub(super) solved: Option<Arc<Solved>>,
     estimate: Option<Estimate>,
+    /// Counts what was heard of the solver: its irradiance is another each time.
+    heard: u64,
     frames: BTreeMap<usize, Picture>,
     asked_frames: BTreeSet<usize>,
     overlays: BTreeMap<OverlayKey, Overlay>,
@@ -228,7 +230,7 @@ impl App {
         program: Arc<dyn Program>,
         kept: Arc<Mutex<Kept>>,
     ) -> Self {
-        render.renderer.write().callback_resources.insert(Display::new(&render.device, render.target_format));
+        render.renderer.write().callback_resources.insert(Canvas::new(&render.device, render.target_format));
         let device = Device::heard(&render.device, context);
         let (sender, inbox) = mpsc::channel();
         let ctx = context.clone();
@@ -264,6 +266,7 @@ impl App {
             ready: None,
             solved: None,
             estimate: None,
+            heard: 0,
             frames: BTreeMap::new(),
             asked_frames: BTreeSet::new(),
             overlays: BTreeMap::new(),
@@ -519,6 +522,7 @@ impl App {
                         running.began = Instant::now();
                     }
                     (running.stage, running.fraction, running.divisor) = (stage, fraction, divisor);
+                    self.heard += 1;
                 }
             }
             News::Warning(serial, text) => {
@@ -593,7 +597,8 @@ impl App {
             Source::Merge => Some(ready.merge.clone()),
             Source::Result => {
                 if let Some(e) = &self.estimate {
-                    return Some(Picture { planes: e.planes.clone(), place: Place::padded(e.width, e.height, e.pad) });
+                    let place = Place::padded(e.width, e.height, e.pad);
+                    return Some(Picture { planes: e.planes.clone(), place, version: self.heard });
                 }
                 Some(self.solved.as_ref().map_or_else(|| ready.merge.clone(), |s| s.picture.clone()))
             }
@@ -631,26 +636,25 @@ impl App {
         let ready = self.ready.clone()?;
         let operator = Operator::parse(&self.session.look.words()).unwrap_or_default();
         let curve = operator.curve(&self.light()?)?;
-        let m = &ready.opened.to_display;
-        let column = |c: usize| [m[0][c] as f32, m[1][c] as f32, m[2][c] as f32, 0.0];
         let overlay = self.overlay_picture();
-        let (a, b) = (self.picture(self.before), self.picture(self.after));
-        Some(Shown {
-            params: DisplayParams {
-                matrix: [column(0), column(1), column(2)],
-                gain: curve.gain,
-                white: curve.white,
-                saturation: curve.saturation,
-                filmic: u32::from(curve.filmic),
-                overlay_kind: overlay.as_ref().map_or(0, |o| o.1),
-                extremes: u32::from(self.extremes),
-                background,
-                ..DisplayParams::default()
-            },
-            a,
-            b,
-            overlay: overlay.map(|o| o.0),
-        })
+        // Half precision is finest about 1.
+        let (m, unit) = (&ready.opened.to_display, ready.light.middle);
+        let column = |c: usize| [m[0][c], m[1][c], m[2][c], 0.0].map(|v| v as f32 / unit);
+        let matrix = [column(0), column(1), column(2)];
+        let sides = [self.before, self.after].map(|source| {
+            let picture = self.picture(source)?;
+            Some(Side { picture, matrix, curve: u32::from(curve.filmic) })
+        });
+        let params = DisplayParams {
+            gain: curve.gain * unit,
+            white: curve.white,
+            saturation: curve.saturation,
+            overlay_kind: overlay.as_ref().map_or(0, |o| o.1),
+            extremes: u32::from(self.extremes),
+            background,
+            ..DisplayParams::default()
+        };
+        Some(Shown { params, sides, overlay: overlay.map(|o| o.0) })
     }
 
     pub(super) fn source_name(&self, source: Source) -> String {

@@ -35,16 +35,18 @@ const THUMBNAIL: u32 = 224;
 pub const BINS_PER_STOP: usize = 4;
 
 /// A picture on the device, irradiance E in its planes.
-#[derive(Clone)]
+#[derive(Clone, PartialEq)]
 pub struct Picture {
     /// The planes.
     pub planes: Channels,
     /// Where in them.
     pub place: Place,
+    /// Differs when what the planes hold does.
+    pub version: u64,
 }
 
 /// A plane on the device.
-#[derive(Clone)]
+#[derive(Clone, PartialEq)]
 pub struct Overlay {
     /// Its values.
     pub plane: wgpu::Buffer,
@@ -468,7 +470,7 @@ fn light(irradiance: &Rgb, opened: &Opened) -> Light {
 fn upload(gpu: &Gpu, image: &Rgb) -> crate::error::Result<Picture> {
     let (w, h) = image.size();
     let plane = |c: usize| gpu.upload("picture", &image.0[c].data);
-    Ok(Picture { planes: [plane(0)?, plane(1)?, plane(2)?], place: Place::padded(w, h, 0) })
+    Ok(Picture { planes: [plane(0)?, plane(1)?, plane(2)?], place: Place::padded(w, h, 0), version: 0 })
 }
 
 fn thumbnail(path: &Path) -> Result<Thumbnail, String> {
