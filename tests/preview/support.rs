@@ -90,9 +90,8 @@ impl Window {
         self.wait("the solution", 240, |app| !app.is_busy() && app.solution().is_some_and(|s| s.divisor == 1));
     }
 
-    /// What the window shows, as pixels.
-    pub fn picture(&mut self) -> image::RgbImage {
-        self.harness.step();
+    /// Draws what the window shows.
+    pub fn draw(&self) -> wgpu::Texture {
         let (ctx, output, render) = (&self.harness.ctx, self.harness.output(), &self.render);
         let per_point = ctx.pixels_per_point();
         let size = [(SIZE.x * per_point) as u32, (SIZE.y * per_point) as u32];
@@ -123,6 +122,22 @@ impl Window {
             let mut pass = encoder.begin_render_pass(&descriptor).forget_lifetime();
             renderer.render(&mut pass, &shapes, &screen);
         }
+        render.queue.submit(buffers.into_iter().chain([encoder.finish()]));
+        texture
+    }
+
+    /// Waits for the device.
+    pub fn settle(&self) {
+        let wait = wgpu::PollType::Wait { submission_index: None, timeout: Some(Duration::from_secs(60)) };
+        self.render.device.poll(wait).expect("the device answers");
+    }
+
+    /// What the window shows, as pixels.
+    pub fn picture(&mut self) -> image::RgbImage {
+        self.harness.step();
+        let (texture, render) = (self.draw(), &self.render);
+        let size = [texture.width(), texture.height()];
+        let mut encoder = render.device.create_command_encoder(&Default::default());
         let row = (4 * size[0]).next_multiple_of(256);
         let staging = render.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("window"),
@@ -133,10 +148,9 @@ impl Window {
         let layout = wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(row), rows_per_image: None };
         let to = wgpu::TexelCopyBufferInfo { buffer: &staging, layout };
         encoder.copy_texture_to_buffer(texture.as_image_copy(), to, texture.size());
-        render.queue.submit(buffers.into_iter().chain([encoder.finish()]));
+        render.queue.submit([encoder.finish()]);
         staging.map_async(wgpu::MapMode::Read, .., |r| r.expect("the picture is mapped"));
-        let wait = wgpu::PollType::Wait { submission_index: None, timeout: Some(Duration::from_secs(60)) };
-        render.device.poll(wait).expect("the device answers");
+        self.settle();
         let bytes = staging.get_mapped_range(..).expect("mapped");
         let swapped = matches!(render.target_format, wgpu::TextureFormat::Bgra8Unorm | wgpu::TextureFormat::Bgra8UnormSrgb);
         let picture = image::RgbImage::from_fn(size[0], size[1], |x, y| {
@@ -162,7 +176,12 @@ pub enum Times {
 
 /// A small bracket: 1/15 and 1/4 s sharp, 1 s shaken.
 pub fn frames(folder: &Path, times: Times) -> Vec<PathBuf> {
-    let scene = synth::room(128, 96, 24, 3);
+    sized_frames(folder, times, (128, 96))
+}
+
+/// The same at a size.
+pub fn sized_frames(folder: &Path, times: Times, (width, height): (usize, usize)) -> Vec<PathBuf> {
+    let scene = synth::room(width, height, 24, 3);
     let shake = Tremor { extent_px: 5.0, roll_deg: 0.3, offset_px: 0.5, offset_deg: 0.0 };
     let wanted = [(1.0 / 15.0, None), (0.25, None), (1.0, Some(shake))];
     let made = synth::capture(&scene, &Camera::default(), &wanted, 0.08, 5).expect("a bracket");

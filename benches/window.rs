@@ -1,0 +1,87 @@
+//! `cargo bench --features preview-tests --bench window`: milliseconds per redraw of the window with a picture of 1152 x 864 pixels, as
+//! medians: from the event to the finished picture, the interface's own work included.
+
+#[path = "../tests/preview/support.rs"]
+#[expect(dead_code, reason = "the tests of the window need more of it")]
+mod support;
+
+use egui::{Key, Pos2, Vec2};
+use egui_kittest::kittest::Queryable;
+use std::time::{Duration, Instant};
+use support::{Times, Window, sized_frames};
+
+/// Redraws of each kind.
+const TIMES: usize = 15;
+
+/// Milliseconds of the median redraw after `event` and those it asks for.
+fn median(window: &mut Window, mut event: impl FnMut(&mut Window, usize)) -> f64 {
+    let mut all: Vec<f64> = (0..TIMES)
+        .map(|i| {
+            let start = Instant::now();
+            event(window, i);
+            window.harness.step();
+            window.draw();
+            window.settle();
+            1e3 * start.elapsed().as_secs_f64()
+        })
+        .collect();
+    all.sort_unstable_by(f64::total_cmp);
+    all[TIMES / 2]
+}
+
+/// Milliseconds of redraws while the pointer, its button held, goes back and forth from `from`.
+fn dragged(window: &mut Window, from: Pos2) -> f64 {
+    window.harness.hover_at(from);
+    window.harness.run_steps(2);
+    window.harness.drag_at(from);
+    window.harness.run_steps(2);
+    let found = median(window, |w, i| w.harness.hover_at(from + Vec2::new(20.0 + 7.0 * (i % 5) as f32, 3.0 * (i % 4) as f32)));
+    window.harness.drop_at(from);
+    window.harness.run_steps(3);
+    found
+}
+
+fn wheel(window: &mut Window, i: usize) {
+    window.harness.event(egui::Event::MouseWheel {
+        unit: egui::MouseWheelUnit::Point,
+        delta: Vec2::new(0.0, if i.is_multiple_of(2) { 20.0 } else { -20.0 }),
+        phase: egui::TouchPhase::Move,
+        source: egui::MouseWheelSource::Unknown,
+        modifiers: egui::Modifiers::NONE,
+    });
+}
+
+fn main() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let files = sized_frames(folder.path(), Times::Exif, (1152, 864));
+    let mut window = Window::open(&files);
+    window.harness.run_steps(2);
+    let view = window.harness.get_by_label("Main view").rect();
+    window.harness.hover_at(view.center());
+    window.wait("the plain merge", 240, |app| app.probed().is_some());
+    window.harness.key_press(Key::Escape);
+    window.harness.run_steps(4);
+    // The solver stops where it next looks.
+    std::thread::sleep(Duration::from_secs(8));
+    window.harness.run_steps(4);
+    let view = window.harness.get_by_label("Main view").rect();
+    println!("view of {} x {} points", view.width(), view.height());
+    for (name, key) in [("whole frame", Key::F), ("actual pixels", Key::Num1)] {
+        window.harness.key_press(key);
+        window.harness.run_steps(4);
+        window.harness.hover_at(view.center() + Vec2::new(100.0, 50.0));
+        median(&mut window, |_, _| {});
+        let idle = median(&mut window, |w, i| w.harness.hover_at(view.center() + Vec2::new(100.0 + (i % 3) as f32, 50.0)));
+        let exposure = median(&mut window, |w, i| w.harness.key_press(if i % 2 == 0 { Key::CloseBracket } else { Key::OpenBracket }));
+        let grip = window.harness.get_by_label("Divider between before and after").rect().center();
+        let divider = dragged(&mut window, grip);
+        let zoom = median(&mut window, wheel);
+        window.harness.run_steps(30);
+        window.harness.key_press(key);
+        window.harness.run_steps(4);
+        let pan = dragged(&mut window, view.center() + Vec2::new(150.0, 100.0));
+        window.harness.key_press(key);
+        window.harness.run_steps(4);
+        println!("{name}: idle {idle:.1} exposure {exposure:.1} divider {divider:.1} zoom {zoom:.1} pan {pan:.1} ms");
+    }
+}
