@@ -7,7 +7,9 @@ mod support;
 
 use egui::{Key, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
+use unshaken::preview::Options;
 use support::{Times, Window, sized_frames};
 
 /// Redraws of each kind.
@@ -54,7 +56,8 @@ fn wheel(window: &mut Window, i: usize) {
 fn main() {
     let folder = tempfile::tempdir().expect("a folder");
     let files = sized_frames(folder.path(), Times::Exif, (1152, 864));
-    let mut window = Window::open(&files);
+    let options = Options { files, ..Options::default() };
+    let mut window = Window::drawn(&options, Arc::default(), 1.0, egui_wgpu::RendererOptions::default());
     window.harness.run_steps(2);
     let view = window.harness.get_by_label("Main view").rect();
     window.harness.hover_at(view.center());

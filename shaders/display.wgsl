@@ -10,46 +10,45 @@ struct Overlay {
     first: u32,      // index of the overlay's first value
 }
 
+// What a view does not need is left out of its pipeline: software rasterisers carry out both sides of every branch.
+override curve = 1u;        // 0 Reinhard, 1 filmic, 2 none: the picture is toned
+override overlay_kind = 0u; // 0 none, 1 mask, 2 residual, 3 clipped
+override saturated = true;  // whether colours keep
+override extremes = false;  // show what the curve makes white or black
+override encoded = true;    // the target takes sRGB codes; else it encodes by itself
+override between = false;   // sample between texels; else one
+
 struct Params {
     pan: vec2f,      // point of the frame at the view's corner, pixels of the full frame
     frame: vec2f,    // full frame, pixels
+    scale: vec2f,    // texels per pixel of the full frame
     per_pixel: f32,  // pixels of the frame per pixel of the screen
     gain: f32,
     white: f32,
     saturation: f32,
     overlay: Overlay,
-    curve: u32,        // 0 Reinhard, 1 filmic, 2 none: the picture is toned
-    overlay_kind: u32, // 0 none, 1 mask, 2 residual, 3 clipped
-    extremes: u32,     // 1: show what the curve makes white or black
-    encoded: u32,      // 1: the target takes sRGB codes; 0: it encodes by itself
-    background: f32,   // sRGB code beyond the frame
+    level: u32,      // of the picture's smaller copies
+    reach: f32,      // from the fragment's centre to where it is sampled, texels
+    linear: u32,     // 1: weigh by distance; 0: the mean
+    background: f32, // sRGB code beyond the frame
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var picture: texture_2d<f32>;
 @group(0) @binding(2) var<storage, read> overlay: array<f32>;
 
-// Light at `q` (pixels of the frame, the first centre at 0.5): the mean where the screen is coarser than the picture, the pixel where
-// it is finer, between pixels where the picture is a reduced one.
+// Light at `q` (pixels of the frame, the first centre at 0.5).
 fn light(q: vec2f) -> vec3f {
-    let scale = vec2f(textureDimensions(picture)) / params.frame;
-    let step = params.per_pixel * scale.x;
-    // Of the smaller copy that is still finer than the screen, but no more than twice, the texels in the quarters of the fragment.
-    let level = clamp(i32(ceil(log2(step * 0.999))) - 1, 0, i32(textureNumLevels(picture)) - 1);
-    let shrunk = exp2(-f32(level));
-    let p = q * scale * shrunk;
-    var reach = 0.25 * step * shrunk;
-    var part = vec2f(0.5);
-    if step <= 1.001 {
-        let reduced = scale.x <= 0.99;
-        reach = select(0.0, 0.5, reduced);
-        part = fract(p - 0.5);
+    let p = q * params.scale;
+    let last = vec2i(textureDimensions(picture, params.level)) - 1;
+    if !between {
+        return textureLoad(picture, min(vec2i(p), last), params.level).rgb;
     }
-    let last = vec2i(textureDimensions(picture, level)) - 1;
-    let a = clamp(vec2i(floor(p - reach)), vec2i(0), last);
-    let b = clamp(vec2i(floor(p + reach)), vec2i(0), last);
-    let upper = mix(textureLoad(picture, a, level), textureLoad(picture, vec2i(b.x, a.y), level), part.x);
-    let lower = mix(textureLoad(picture, vec2i(a.x, b.y), level), textureLoad(picture, b, level), part.x);
+    let part = select(vec2f(0.5), fract(p - 0.5), params.linear == 1u);
+    let a = clamp(vec2i(floor(p - params.reach)), vec2i(0), last);
+    let b = clamp(vec2i(floor(p + params.reach)), vec2i(0), last);
+    let upper = mix(textureLoad(picture, a, params.level), textureLoad(picture, vec2i(b.x, a.y), params.level), part.x);
+    let lower = mix(textureLoad(picture, vec2i(a.x, b.y), params.level), textureLoad(picture, b, params.level), part.x);
     return mix(upper, lower, part.y).rgb;
 }
 
@@ -58,11 +57,11 @@ fn hable(x: f32) -> f32 {
 }
 
 fn shown(luminance: f32) -> f32 {
-    if params.curve == 2u {
+    if curve == 2u {
         return luminance;
     }
     let v = min(luminance * params.gain, 1e12);
-    if params.curve == 1u {
+    if curve == 1u {
         return hable(2.0 * min(v, params.white)) / hable(2.0 * params.white);
     }
     return v * (1.0 + v / (params.white * params.white)) / (1.0 + v);
@@ -86,7 +85,7 @@ fn tone(linear: vec3f) -> vec4f {
         return vec4f(0.0, 0.0, 0.0, -1.0);
     }
     var ratio = own / y;
-    if params.saturation != 1.0 {
+    if !saturated {
         ratio = pow(ratio, vec3f(params.saturation));
     }
     var rgb = min(s, 4.0) * ratio;
@@ -122,20 +121,20 @@ fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
     if all(q >= vec2f(0.0)) && all(q < params.frame) {
         let toned = tone(light(q));
         code = encode(toned.xyz);
-        if params.extremes == 1u && toned.w > 0.5 {
+        if extremes && toned.w > 0.5 {
             code = vec3f(0.9, 0.1, 0.1);
         }
-        if params.extremes == 1u && toned.w < -0.5 {
+        if extremes && toned.w < -0.5 {
             code = vec3f(0.15, 0.3, 0.95);
         }
-        if params.overlay_kind > 0u {
+        if overlay_kind > 0u {
             let o = params.overlay;
             let p = vec2u(clamp(floor(q * vec2f(o.size) / params.frame), vec2f(0.0), vec2f(o.size) - 1.0));
             let v = overlay[o.first + p.y * o.stride + p.x];
-            if params.overlay_kind == 1u {
+            if overlay_kind == 1u {
                 // What does not count is red.
                 code = mix(code, vec3f(0.85, 0.1, 0.15), 0.75 * (1.0 - v));
-            } else if params.overlay_kind == 2u {
+            } else if overlay_kind == 2u {
                 // chi squared: 1 is what noise explains, 16 is bright.
                 code = mix(code * 0.25, heat(0.25 * log2(max(v, 1.0))), step(1.0, v));
             } else if v > 0.5 {
@@ -145,7 +144,7 @@ fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
             }
         }
     }
-    if params.encoded == 1u {
+    if encoded {
         return vec4f(code, 1.0);
     }
     return vec4f(decode(code), 1.0);

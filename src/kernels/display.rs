@@ -1,6 +1,7 @@
 //! Irradiance from the solver's planes to a render target: `picture.wgsl`, `shrink.wgsl`, `display.wgsl`.
 
 use super::Channels;
+use std::collections::HashMap;
 use std::ops::Range;
 use wgpu::util::DeviceExt;
 
@@ -44,13 +45,27 @@ struct PictureParams {
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct ShrinkParams {
     origin: [u32; 2],
-    factor: u32,
-    _pad: u32,
 }
 
-/// How a picture is shown; see the shader for each field.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct Params {
+    pan: [f32; 2],
+    frame: [f32; 2],
+    scale: [f32; 2],
+    per_pixel: f32,
+    gain: f32,
+    white: f32,
+    saturation: f32,
+    overlay: Place,
+    level: u32,
+    reach: f32,
+    linear: u32,
+    background: f32,
+}
+
+/// How a picture is shown.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DisplayParams {
     /// Point of the frame at the view's corner.
     pub pan: [f32; 2],
@@ -64,25 +79,56 @@ pub struct DisplayParams {
     pub white: f32,
     /// 1 keeps the colours.
     pub saturation: f32,
+    /// 0: Reinhard; 1: filmic; 2: the picture is toned, and exposure and colours are its own.
+    pub curve: u32,
     /// Drawn over the picture.
     pub overlay: Place,
-    /// 0: Reinhard; 1: filmic; 2: the picture is toned.
-    pub curve: u32,
     /// 0 none, 1 mask, 2 residual, 3 clipped.
     pub overlay_kind: u32,
-    /// 1: what the curve makes white or black is marked.
-    pub extremes: u32,
-    /// 1: the target takes sRGB codes.
-    pub encoded: u32,
+    /// What the curve makes white or black is marked.
+    pub extremes: bool,
     /// sRGB code beyond the frame.
     pub background: f32,
-    /// Nothing.
-    pub _pad: [u32; 3],
+}
+
+/// Where a fragment is sampled.
+struct Sampling {
+    level: u32,
+    scale: [f32; 2],
+    reach: f32,
+    linear: bool,
+}
+
+impl Sampling {
+    /// Of a picture of `size` texels with `levels` copies, for `frame` and `per_pixel` of the parameters: the mean where the screen is
+    /// coarser than the picture, the pixel where it is finer, between pixels where the picture is a reduced one.
+    fn of(size: [u32; 2], levels: u32, frame: [f32; 2], per_pixel: f32) -> Self {
+        let scale = [size[0] as f32 / frame[0], size[1] as f32 / frame[1]];
+        let step = per_pixel * scale[0];
+        if step <= 1.001 {
+            let linear = scale[0] <= 0.99;
+            return Self { level: 0, scale, reach: if linear { 0.5 } else { 0.0 }, linear };
+        }
+        // Of the copy that is finer than the screen, but no more than twice, the texels in the quarters of the fragment.
+        let level = ((step * 0.999).log2().ceil() as u32).saturating_sub(1).min(levels - 1);
+        let shrunk = 0.5f32.powi(level as i32);
+        Self { level, scale: scale.map(|s| s * shrunk), reach: 0.25 * step * shrunk, linear: false }
+    }
+}
+
+/// What pipelines of the last shader differ in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Variant {
+    curve: u32,
+    overlay_kind: u32,
+    saturated: bool,
+    extremes: bool,
+    between: bool,
 }
 
 /// Sizes of the mirrors, as [`super::params_sizes`].
 pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
-    vec![("picture", size_of::<PictureParams>()), ("shrink", size_of::<ShrinkParams>()), ("display", size_of::<DisplayParams>())]
+    vec![("picture", size_of::<PictureParams>()), ("shrink", size_of::<ShrinkParams>()), ("display", size_of::<Params>())]
 }
 
 /// A shader that fills a target.
@@ -93,10 +139,10 @@ struct Filling {
 }
 
 impl Filling {
-    fn new(device: &wgpu::Device, label: &'static str, source: &str, format: wgpu::TextureFormat) -> Self {
+    fn new(device: &wgpu::Device, label: &'static str, source: &str, constants: &[(&str, f64)], format: wgpu::TextureFormat) -> Self {
         let module =
             device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) });
-        let stage = wgpu::PipelineCompilationOptions::default();
+        let stage = wgpu::PipelineCompilationOptions { constants, ..Default::default() };
         let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
             label: Some(label),
             layout: None,
@@ -160,7 +206,8 @@ fn level(texture: &wgpu::Texture, level: u32) -> wgpu::TextureView {
 pub struct Display {
     picture: Filling,
     halve: Filling,
-    display: Filling,
+    /// Compiled when they are first needed.
+    display: HashMap<Variant, Filling>,
     copy: Filling,
     format: wgpu::TextureFormat,
     /// Where there is no picture, and no overlay.
@@ -188,10 +235,10 @@ impl Display {
             mapped_at_creation: false,
         });
         Self {
-            picture: Filling::new(device, "picture", PICTURE, PICTURES),
-            halve: Filling::new(device, "shrink", SHRINK, PICTURES),
-            display: Filling::new(device, "display", DISPLAY, format),
-            copy: Filling::new(device, "shrink", SHRINK, format),
+            picture: Filling::new(device, "picture", PICTURE, &[], PICTURES),
+            halve: Filling::new(device, "shrink", SHRINK, &[("factor", 2.0)], PICTURES),
+            display: HashMap::new(),
+            copy: Filling::new(device, "shrink", SHRINK, &[("factor", 1.0)], format),
             format,
             nothing: texture(device, "no picture", [1, 1], 1, PICTURES, wgpu::TextureUsages::TEXTURE_BINDING),
             empty,
@@ -232,7 +279,7 @@ impl Display {
         let bindings = self.picture.bind(device, &params, &resources);
         self.picture.draw(&mut begin(encoder, "picture", &level(room, 0)), &bindings);
         for i in 1..room.mip_level_count() {
-            let params = ShrinkParams { origin: [0, 0], factor: 2, _pad: 0 };
+            let params = ShrinkParams { origin: [0, 0] };
             let larger = level(room, i - 1);
             let bindings = self.halve.bind(device, &params, &[wgpu::BindingResource::TextureView(&larger)]);
             self.halve.draw(&mut begin(encoder, "shrink", &level(room, i)), &bindings);
@@ -247,7 +294,7 @@ impl Display {
 
     /// Records the drawing of `parts` into `view`.
     pub fn draw(
-        &self,
+        &mut self,
         device: &wgpu::Device,
         encoder: &mut wgpu::CommandEncoder,
         view: &wgpu::Texture,
@@ -255,25 +302,55 @@ impl Display {
         overlay: Option<&wgpu::Buffer>,
     ) {
         let mut pass = begin(encoder, "display", &level(view, 0));
-        for part in parts {
-            let own = DisplayParams {
-                encoded: u32::from(!self.format.is_srgb()),
-                overlay_kind: if overlay.is_some() { part.params.overlay_kind } else { 0 },
-                // Without a picture all is beyond it.
-                frame: if part.picture.is_some() { part.params.frame } else { [0.0; 2] },
-                ..part.params
+        for Part { columns, params: p, picture } in parts {
+            let texture = picture.unwrap_or(&self.nothing);
+            let at = Sampling::of([texture.width(), texture.height()], texture.mip_level_count(), p.frame, p.per_pixel);
+            let variant = Variant {
+                curve: p.curve,
+                overlay_kind: if overlay.is_some() { p.overlay_kind } else { 0 },
+                saturated: p.saturation == 1.0 || p.curve == 2,
+                extremes: p.extremes,
+                between: at.reach > 0.0,
             };
-            let picture = part.picture.unwrap_or(&self.nothing).create_view(&Default::default());
+            let params = Params {
+                pan: p.pan,
+                // Without a picture all is beyond it.
+                frame: if picture.is_some() { p.frame } else { [0.0; 2] },
+                scale: at.scale,
+                per_pixel: p.per_pixel,
+                gain: p.gain,
+                white: p.white,
+                saturation: p.saturation,
+                overlay: p.overlay,
+                level: at.level,
+                reach: at.reach,
+                linear: u32::from(at.linear),
+                background: p.background,
+            };
+            let format = self.format;
+            let display = self.display.entry(variant).or_insert_with(|| {
+                let flag = |v: bool| f64::from(u8::from(v));
+                let constants = [
+                    ("curve", f64::from(variant.curve)),
+                    ("overlay_kind", f64::from(variant.overlay_kind)),
+                    ("saturated", flag(variant.saturated)),
+                    ("extremes", flag(variant.extremes)),
+                    ("encoded", flag(!format.is_srgb())),
+                    ("between", flag(variant.between)),
+                ];
+                Filling::new(device, "display", DISPLAY, &constants, format)
+            });
+            let picture = texture.create_view(&Default::default());
             let overlay = overlay.unwrap_or(&self.empty).as_entire_binding();
-            let bindings = self.display.bind(device, &own, &[wgpu::BindingResource::TextureView(&picture), overlay]);
-            pass.set_scissor_rect(part.columns.start, 0, part.columns.end - part.columns.start, view.height());
-            self.display.draw(&mut pass, &bindings);
+            let bindings = display.bind(device, &params, &[wgpu::BindingResource::TextureView(&picture), overlay]);
+            pass.set_scissor_rect(columns.start, 0, columns.end - columns.start, view.height());
+            display.draw(&mut pass, &bindings);
         }
     }
 
     /// For [`Display::copy`]: `view`, with its corner at the pixel `origin` of the target.
     pub fn placed(&self, device: &wgpu::Device, view: &wgpu::Texture, origin: [u32; 2]) -> wgpu::BindGroup {
-        let params = ShrinkParams { origin, factor: 1, _pad: 0 };
+        let params = ShrinkParams { origin };
         self.copy.bind(device, &params, &[wgpu::BindingResource::TextureView(&level(view, 0))])
     }
 

@@ -1,5 +1,6 @@
 //! The window as egui_kittest drives it, drawn with egui_wgpu on the device that it shares with the solver.
 
+use eframe::App as _;
 use egui_kittest::{Harness, TestRenderer};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -8,6 +9,7 @@ use unshaken::cli::preview::Merge;
 use unshaken::exposure::Frame;
 use unshaken::io::exif::{self, Format};
 use unshaken::preview::app::Kept;
+use unshaken::preview::canvas::Canvas;
 use unshaken::preview::{self, App, Options};
 use unshaken::synth::{self, Camera, Tremor};
 
@@ -44,11 +46,15 @@ impl Window {
     }
 
     pub fn with(options: &Options, kept: Arc<Mutex<Kept>>, pixels_per_point: f32) -> Self {
+        Self::drawn(options, kept, pixels_per_point, egui_wgpu::RendererOptions::PREDICTABLE)
+    }
+
+    /// With a renderer as the tests have it, or as the program.
+    pub fn drawn(options: &Options, kept: Arc<Mutex<Kept>>, pixels_per_point: f32, renderer: egui_wgpu::RendererOptions) -> Self {
         let setup = preview::setup();
         let instance = pollster::block_on(setup.new_instance());
         let configuration = egui_wgpu::WgpuConfiguration { wgpu_setup: setup, ..Default::default() };
-        let options_of_renderer = egui_wgpu::RendererOptions::PREDICTABLE;
-        let render = pollster::block_on(egui_wgpu::RenderState::create(&configuration, &instance, None, options_of_renderer))
+        let render = pollster::block_on(egui_wgpu::RenderState::create(&configuration, &instance, None, renderer))
             .unwrap_or_else(|e| panic!("the tests need a GPU adapter: {e}"));
         let (options, own, keep) = (options.clone(), render.clone(), kept.clone());
         let builder = Harness::builder().with_size(SIZE).with_pixels_per_point(pixels_per_point).renderer(Textures(render.clone()));
@@ -111,11 +117,13 @@ impl Window {
             view_formats: &[],
         });
         let view = texture.create_view(&Default::default());
+        let [r, g, b, a] = self.app().clear_color(&ctx.global_style().visuals).map(f64::from);
+        let ground = wgpu::Color { r, g, b, a };
         {
             let attachment = wgpu::RenderPassColorAttachment {
                 view: &view,
                 resolve_target: None,
-                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Store },
+                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(ground), store: wgpu::StoreOp::Store },
                 depth_slice: None,
             };
             let descriptor = wgpu::RenderPassDescriptor { color_attachments: &[Some(attachment)], ..Default::default() };
@@ -124,6 +132,13 @@ impl Window {
         }
         render.queue.submit(buffers.into_iter().chain([encoder.finish()]));
         texture
+    }
+
+    /// How often a picture was converted, and how often the view was drawn.
+    pub fn counts(&self) -> (usize, usize) {
+        let renderer = self.render.renderer.read();
+        let canvas = renderer.callback_resources.get::<Canvas>().expect("made with the window");
+        (canvas.conversions, canvas.drawings)
     }
 
     /// Waits for the device.
