@@ -26,9 +26,9 @@ struct Params {
     gain: f32,
     white: f32,
     saturation: f32,
-    overlay: Overlay,
     level: u32,      // of the picture's smaller copies
     reach: f32,      // from the fragment's centre to where it is sampled, texels
+    overlay: Overlay,
     linear: u32,     // 1: weigh by distance; 0: the mean
     background: f32, // sRGB code beyond the frame
 }

@@ -57,9 +57,9 @@ struct Params {
     gain: f32,
     white: f32,
     saturation: f32,
-    overlay: Place,
     level: u32,
     reach: f32,
+    overlay: Place,
     linear: u32,
     background: f32,
 }

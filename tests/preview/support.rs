@@ -1,6 +1,7 @@
 //! The window as egui_kittest drives it, drawn with egui_wgpu on the device that it shares with the solver.
 
 use eframe::App as _;
+use egui_kittest::kittest::Queryable;
 use egui_kittest::{Harness, TestRenderer};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -141,6 +142,21 @@ impl Window {
         (canvas.conversions, canvas.drawings)
     }
 
+    /// Drops files on the window.
+    pub fn drop_files(&mut self, files: &[PathBuf]) {
+        let handles = files.iter().map(|f| Arc::new(Dropped(f.clone())) as egui::DroppedFileHandle);
+        self.harness.input_mut().dropped_files = handles.collect();
+    }
+
+    /// Chooses a tone curve.
+    pub fn choose_curve(&mut self, name: &str) {
+        let now = self.app().session().look.curve.clone();
+        self.harness.get_by_value(&now).click();
+        self.harness.run_steps(3);
+        self.harness.get_by_label(name).click();
+        self.harness.run_steps(2);
+    }
+
     /// Waits for the device.
     pub fn settle(&self) {
         let wait = wgpu::PollType::Wait { submission_index: None, timeout: Some(Duration::from_secs(60)) };
@@ -180,6 +196,32 @@ impl Window {
         }
         picture
     }
+}
+
+/// A file as the desktop hands it over.
+#[derive(Debug)]
+struct Dropped(PathBuf);
+
+impl egui::DroppedFile for Dropped {
+    fn path(&self) -> &Path {
+        &self.0
+    }
+
+    fn bytes(&self) -> Result<Vec<u8>, String> {
+        std::fs::read(&self.0).map_err(|e| e.to_string())
+    }
+}
+
+/// Draws until `done`, at most a minute.
+#[track_caller]
+pub fn until(window: &mut Window, what: &str, done: impl Fn(&Window) -> bool) {
+    let start = Instant::now();
+    while !done(window) {
+        assert!(start.elapsed() < Duration::from_secs(60), "{what} did not come");
+        window.harness.step();
+        std::thread::sleep(Duration::from_millis(15));
+    }
+    window.harness.run_steps(2);
 }
 
 /// How frames note their exposure time.
