@@ -9,8 +9,8 @@ use egui::{Key, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use unshaken::preview::Options;
 use support::{Times, Window, sized_frames};
+use unshaken::preview::Options;
 
 /// Redraws of each kind.
 const TIMES: usize = 15;

@@ -140,8 +140,8 @@ struct Filling {
 
 impl Filling {
     fn new(device: &wgpu::Device, label: &'static str, source: &str, constants: &[(&str, f64)], format: wgpu::TextureFormat) -> Self {
-        let module =
-            device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) });
+        let module = device
+            .create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) });
         let stage = wgpu::PipelineCompilationOptions { constants, ..Default::default() };
         let pipeline = device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
             label: Some(label),

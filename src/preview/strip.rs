@@ -1,7 +1,7 @@
 //! The strip of thumbnails, and the line of state below it.
 
-use super::controls::bare;
 use super::app::{App, Source};
+use super::controls::bare;
 use egui::{Color32, RichText, Vec2};
 
 /// Height of a thumbnail in points.

@@ -329,7 +329,8 @@ impl Workers {
                         break;
                     }
                     let toned = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| toned(&own, &request, picture)));
-                    let failed = || format!("tone mapping, {}: stopped on an error of its own; choose another tone curve", request.operator.name());
+                    let failed =
+                        || format!("tone mapping, {}: stopped on an error of its own; choose another tone curve", request.operator.name());
                     hear(News::Toned(toned.map_or_else(|_| Err(failed()), |t| t.map_err(|e| e.to_string()))));
                 }
                 if next.is_none() {

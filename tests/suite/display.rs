@@ -91,7 +91,10 @@ fn a_pixel_of_the_screen_shows_the_mean_of_what_it_covers() {
             let mut seen = 0;
             for y in 0..VIEW {
                 for x in 0..VIEW {
-                    let p = [f64::from(pan[0]) + f64::from(per_pixel) * (f64::from(x) + 0.5), f64::from(pan[1]) + f64::from(per_pixel) * (f64::from(y) + 0.5)];
+                    let p = [
+                        f64::from(pan[0]) + f64::from(per_pixel) * (f64::from(x) + 0.5),
+                        f64::from(pan[1]) + f64::from(per_pixel) * (f64::from(y) + 0.5),
+                    ];
                     let codes = shown[(y * VIEW + x) as usize];
                     if p[0] < 0.0 || p[1] < 0.0 || p[0] >= width as f64 || p[1] >= height as f64 {
                         assert_eq!(codes, [255; 3], "beyond the frame");
@@ -101,7 +104,10 @@ fn a_pixel_of_the_screen_shows_the_mean_of_what_it_covers() {
                     let wanted = toned(&operator, &curve, linear);
                     seen += 1;
                     // Half precision is a twentieth of a code, rounding the rest.
-                    assert!((0..3).all(|c| codes[c].abs_diff(wanted[c]) <= 1), "{words} case {i} at {x}, {y}: {codes:?}, {wanted:?} wanted");
+                    assert!(
+                        (0..3).all(|c| codes[c].abs_diff(wanted[c]) <= 1),
+                        "{words} case {i} at {x}, {y}: {codes:?}, {wanted:?} wanted"
+                    );
                 }
             }
             assert!(seen >= 128, "case {i}: {seen} pixels");
