@@ -273,7 +273,7 @@ impl Display {
         matrix: &[[f32; 4]; 3],
         room: &wgpu::Texture,
     ) {
-        let factor = place.size[0].div_ceil(room.width());
+        let factor = place.size[0].div_ceil(room.width()).max(place.size[1].div_ceil(room.height()));
         let params = PictureParams { matrix: *matrix, place: *place, factor, _pad: [0; 3] };
         let resources = planes.each_ref().map(|p| p.as_entire_binding());
         let bindings = self.picture.bind(device, &params, &resources);

@@ -204,7 +204,7 @@ pub struct App {
     tones: Vec<Toned>,
     asked_tones: Option<Toning>,
     /// Says that one is being computed.
-    pub(super) toning: Option<String>,
+    toning: Option<String>,
     /// The last operator that treats all pixels alike.
     plain: Operator,
     /// Counts the solutions, for what is derived from them.
@@ -550,6 +550,7 @@ impl App {
                 let (w, known) = (estimate.width, self.solved.as_ref().map_or(0, |s| s.bracket.size().0));
                 if current(serial, &self.running) && w >= known {
                     self.estimate = Some(estimate);
+                    self.heard += 1;
                 }
             }
             News::Solved(serial, solved) => {
@@ -926,7 +927,9 @@ impl App {
         }
         canvas::tag(ui, rect, egui::Align2::RIGHT_TOP, &self.source_name(self.after));
         if let Some(sign) = &self.toning {
-            canvas::tag(ui, rect, egui::Align2::RIGHT_BOTTOM, sign);
+            let place = canvas::tag(ui, rect, egui::Align2::RIGHT_BOTTOM, sign);
+            let response = ui.interact(place, ui.scope_id().with("toning"), egui::Sense::hover());
+            response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Label, true, sign));
         }
         Some(layout)
     }

@@ -134,13 +134,14 @@ impl View {
     }
 }
 
-/// A name on the picture.
-pub fn tag(ui: &egui::Ui, rect: Rect, align: egui::Align2, text: &str) {
+/// A name on the picture; returns where it is.
+pub fn tag(ui: &egui::Ui, rect: Rect, align: egui::Align2, text: &str) -> Rect {
     let painter = ui.painter_at(rect);
     let galley = painter.layout_no_wrap(text.into(), egui::FontId::proportional(13.0), Color32::WHITE);
     let place = align.align_size_within_rect(galley.size() + Vec2::new(16.0, 8.0), rect.shrink(8.0));
     painter.rect_filled(place, 4.0, Color32::from_black_alpha(170));
     painter.galley(place.min + Vec2::new(8.0, 4.0), galley, Color32::WHITE);
+    place
 }
 
 /// What one side of the divider shows, and by which curve.

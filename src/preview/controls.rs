@@ -163,9 +163,6 @@ fn look(app: &mut App, ui: &mut egui::Ui) {
             }
         }
     });
-    if let Some(sign) = &app.toning {
-        ui.label(RichText::new(sign).small());
-    }
     ui.add(Slider::new(&mut look.saturation, 0.0..=2.0).text("Saturation").step_by(0.01));
     let keyed = look.has_key();
     let key = Slider::new(&mut look.key, 0.02..=0.6).text("Brightness of the middle").step_by(0.005);

@@ -14,8 +14,9 @@ fn lit(width: usize, height: usize) -> Rgb {
     Rgb(std::array::from_fn(|c| Plane::from_fn(width, height, |x, y| 4f32.powf(values[3 * (y * width + x) + c]))))
 }
 
-/// What a view shows of `image` as of a frame of `frame` pixels; rows of sRGB codes.
-fn view(gpu: &Gpu, image: &Rgb, params: DisplayParams, pad: usize) -> Vec<[u8; 3]> {
+/// What a view shows of `image`, whose planes have `pad` pixels around them, from a texture of one over `shrunk` of its size; rows of
+/// sRGB codes.
+fn view(gpu: &Gpu, image: &Rgb, params: DisplayParams, pad: usize, shrunk: u32) -> Vec<[u8; 3]> {
     let (width, height) = image.size();
     let place = Place::padded(width, height, pad);
     let mut values = vec![f32::MAX; place.stride as usize * (height + 2 * pad)];
@@ -27,7 +28,7 @@ fn view(gpu: &Gpu, image: &Rgb, params: DisplayParams, pad: usize) -> Vec<[u8; 3
     });
     let mut display = Display::new(&gpu.device, wgpu::TextureFormat::Rgba8Unorm);
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    let room = display.room(&gpu.device, &place);
+    let room = display.room(&gpu.device, &Place { size: place.size.map(|n| n.div_ceil(shrunk)), ..place });
     display.picture(&gpu.device, &mut encoder, &planes, &place, &SAME, &room);
     let target = display.view(&gpu.device, [VIEW, VIEW]);
     let parts = [Part { columns: 0..VIEW, params, picture: Some(&room) }];
@@ -60,17 +61,19 @@ fn mean(image: &Rgb, p: [f64; 2], step: f64, n: usize) -> [f32; 3] {
 #[test]
 fn a_pixel_of_the_screen_shows_the_mean_of_what_it_covers() {
     let gpu = gpu();
-    // (size, pixels of the frame per pixel of the screen, corner, samples per side)
+    // (size, pixels of the frame per pixel of the screen, corner, samples per side, pixels of the frame per texel)
     let cases = [
-        ((61, 47), 0.25, [3.0, 5.0], 1),
-        ((61, 47), 1.0, [-9.0, 2.0], 1),
-        ((75, 49), 1.3, [-4.2, -1.9], 2),
-        ((97, 101), 1.83, [0.37, 0.21], 2),
-        ((128, 96), 2.0, [0.0, 0.0], 2),
-        ((128, 96), 4.0, [0.0, 0.0], 4),
-        ((128, 64), 8.0, [0.0, 0.0], 8),
+        ((61, 47), 0.25, [3.0, 5.0], 1, 1),
+        ((61, 47), 1.0, [-9.0, 2.0], 1, 1),
+        ((75, 49), 1.3, [-4.2, -1.9], 2, 1),
+        ((97, 101), 1.83, [0.37, 0.21], 2, 1),
+        ((128, 96), 2.0, [0.0, 0.0], 2, 1),
+        ((128, 96), 4.0, [0.0, 0.0], 4, 1),
+        ((128, 64), 8.0, [0.0, 0.0], 8, 1),
+        ((128, 96), 2.0, [0.0, 0.0], 2, 2),
+        ((126, 96), 6.0, [0.0, 0.0], 6, 3),
     ];
-    for (i, ((width, height), per_pixel, pan, samples)) in cases.into_iter().enumerate() {
+    for (i, ((width, height), per_pixel, pan, samples, shrunk)) in cases.into_iter().enumerate() {
         let image = lit(width, height);
         let light = Light::of(&image);
         for words in ["filmic:exposure=0.4", "reinhard:saturation=0.6"] {
@@ -87,7 +90,7 @@ fn a_pixel_of_the_screen_shows_the_mean_of_what_it_covers() {
                 background: 1.0,
                 ..Default::default()
             };
-            let shown = view(gpu, &image, params, 3 * (i % 2));
+            let shown = view(gpu, &image, params, 3 * (i % 2), shrunk);
             let mut seen = 0;
             for y in 0..VIEW {
                 for x in 0..VIEW {
@@ -142,7 +145,7 @@ fn a_picture_that_is_toned_keeps_its_codes() {
     let code = |x: usize, y: usize, c: usize| ((x + 64 * y) / [1, 5, 16][c] % 256) as u8;
     let image = Rgb(std::array::from_fn(|c| Plane::from_fn(64, 64, |x, y| decode(f32::from(code(x, y, c)) / 255.0))));
     let params = DisplayParams { frame: [64.0, 64.0], per_pixel: 1.0, curve: 2, saturation: 0.3, gain: 7.0, ..Default::default() };
-    for (i, codes) in view(gpu, &image, params, 0).into_iter().enumerate() {
+    for (i, codes) in view(gpu, &image, params, 0, 1).into_iter().enumerate() {
         let wanted = std::array::from_fn(|c| code(i % 64, i / 64, c));
         assert_eq!(codes, wanted, "{i}");
     }
@@ -152,7 +155,7 @@ fn a_picture_that_is_toned_keeps_its_codes() {
 fn between_the_pixels_of_a_reduced_picture_lie_their_means() {
     let image = Rgb(std::array::from_fn(|_| Plane::from_fn(32, 32, |x, _| x as f32 / 31.0)));
     let params = DisplayParams { frame: [64.0, 64.0], per_pixel: 1.0, curve: 2, ..Default::default() };
-    let shown = view(gpu(), &image, params, 0);
+    let shown = view(gpu(), &image, params, 0, 1);
     for x in 1..63 {
         let linear = (0.5 * (f64::from(x as u32) + 0.5) - 0.5) / 31.0;
         let code = if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
