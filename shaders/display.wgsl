@@ -1,91 +1,55 @@
-// An irradiance image on the screen: exposure, tone curve, split, overlays.
+// A picture on the screen: exposure, tone curve, overlays.
 //
-// One fragment is one pixel of the screen. Where it lies in the frame follows from pan and zoom; what lies there is read straight from
-// the planes that the solver works on (f32 storage buffers, one per channel), so that nothing is copied for display. Left of the divider
-// picture A is shown, right of it picture B. The curve c and the colours are those of `tonemap::Operator::apply`, value for value:
+// One fragment is one pixel of the screen. Where it lies in the frame follows from pan and zoom; what lies there is sampled from the
+// picture (picture.wgsl) and its smaller copies. The curve c and the colours are those of `tonemap::Operator::apply`, value for value:
 // luminance Y shows as c(gain Y), colours keep their ratios to Y and pale where the screen cannot hold them.
 
-struct Picture {
-    size: vec2u,     // pixels of the picture, without pad; 0: none
-    stride: u32,     // values per row of the planes
-    first: u32,      // index of the picture's first value
+struct Overlay {
+    size: vec2u,     // pixels of the overlay, without pad
+    stride: u32,     // values per row of the plane
+    first: u32,      // index of the overlay's first value
 }
 
+// What a view does not need is left out of its pipeline: software rasterisers carry out both sides of every branch.
+override curve = 1u;        // 0 Reinhard, 1 filmic, 2 none: the picture is toned
+override overlay_kind = 0u; // 0 none, 1 mask, 2 residual, 3 clipped
+override saturated = true;  // whether colours keep
+override extremes = false;  // show what the curve makes white or black
+override encoded = true;    // the target takes sRGB codes; else it encodes by itself
+override between = false;   // sample between texels; else one
+
 struct Params {
-    matrix: array<vec4f, 3>, // columns: the frames' RGB to Rec. 709
-    origin: vec2f,   // pixel of the screen at the view's corner
-    pan: vec2f,      // point of the frame there, pixels of the full frame
+    pan: vec2f,      // point of the frame at the view's corner, pixels of the full frame
     frame: vec2f,    // full frame, pixels
+    scale: vec2f,    // texels per pixel of the full frame
     per_pixel: f32,  // pixels of the frame per pixel of the screen
-    split: f32,      // divider, pixels of the screen from the view's corner
     gain: f32,
     white: f32,
     saturation: f32,
-    filmic: u32,
-    a: Picture,
-    b: Picture,
-    overlay: Picture,
-    overlay_kind: u32, // 0 none, 1 mask, 2 residual, 3 clipped
-    extremes: u32,     // 1: show what the curve makes white or black
-    encoded: u32,      // 1: the target takes sRGB codes; 0: it encodes by itself
-    background: f32,   // sRGB code beyond the frame
+    level: u32,      // of the picture's smaller copies
+    reach: f32,      // from the fragment's centre to where it is sampled, texels
+    overlay: Overlay,
+    linear: u32,     // 1: weigh by distance; 0: the mean
+    background: f32, // sRGB code beyond the frame
 }
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> a_red: array<f32>;
-@group(0) @binding(2) var<storage, read> a_green: array<f32>;
-@group(0) @binding(3) var<storage, read> a_blue: array<f32>;
-@group(0) @binding(4) var<storage, read> b_red: array<f32>;
-@group(0) @binding(5) var<storage, read> b_green: array<f32>;
-@group(0) @binding(6) var<storage, read> b_blue: array<f32>;
-@group(0) @binding(7) var<storage, read> overlay: array<f32>;
+@group(0) @binding(1) var picture: texture_2d<f32>;
+@group(0) @binding(2) var<storage, read> overlay: array<f32>;
 
-@vertex
-fn corners(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
-    // One triangle that covers the view.
-    return vec4f(f32(i32(i & 1u) * 4 - 1), f32(i32(i >> 1u) * 4 - 1), 0.0, 1.0);
-}
-
-fn value(left: bool, p: vec2i) -> vec3f {
-    var picture = params.b;
-    if left {
-        picture = params.a;
+// Light at `q` (pixels of the frame, the first centre at 0.5).
+fn light(q: vec2f) -> vec3f {
+    let p = q * params.scale;
+    let last = vec2i(textureDimensions(picture, params.level)) - 1;
+    if !between {
+        return textureLoad(picture, min(vec2i(p), last), params.level).rgb;
     }
-    let q = vec2u(clamp(p, vec2i(0), vec2i(picture.size) - 1));
-    let i = picture.first + q.y * picture.stride + q.x;
-    if left {
-        return vec3f(a_red[i], a_green[i], a_blue[i]);
-    }
-    return vec3f(b_red[i], b_green[i], b_blue[i]);
-}
-
-// Irradiance at `q` (pixels of the frame, the first centre at 0.5): the mean where the screen is coarser than the picture, the pixel where
-// it is finer, between pixels where the picture is a reduced one.
-fn irradiance(left: bool, q: vec2f) -> vec3f {
-    let size = vec2f(select(params.b.size, params.a.size, left));
-    let scale = size / params.frame;
-    let step = params.per_pixel * scale.x;
-    let p = q * scale;
-    if step > 1.001 {
-        let n = i32(min(ceil(step), 4.0));
-        var sum = vec3f(0.0);
-        for (var j = 0; j < n; j++) {
-            for (var i = 0; i < n; i++) {
-                let at = p + step * ((vec2f(f32(i), f32(j)) + 0.5) / f32(n) - 0.5);
-                sum += value(left, vec2i(floor(at)));
-            }
-        }
-        return sum / f32(n * n);
-    }
-    if scale.x > 0.99 {
-        return value(left, vec2i(floor(p)));
-    }
-    let c = p - 0.5;
-    let f = fract(c);
-    let i = vec2i(floor(c));
-    let upper = mix(value(left, i), value(left, i + vec2i(1, 0)), f.x);
-    let lower = mix(value(left, i + vec2i(0, 1)), value(left, i + vec2i(1, 1)), f.x);
-    return mix(upper, lower, f.y);
+    let part = select(vec2f(0.5), fract(p - 0.5), params.linear == 1u);
+    let a = clamp(vec2i(floor(p - params.reach)), vec2i(0), last);
+    let b = clamp(vec2i(floor(p + params.reach)), vec2i(0), last);
+    let upper = mix(textureLoad(picture, a, params.level), textureLoad(picture, vec2i(b.x, a.y), params.level), part.x);
+    let lower = mix(textureLoad(picture, vec2i(a.x, b.y), params.level), textureLoad(picture, b, params.level), part.x);
+    return mix(upper, lower, part.y).rgb;
 }
 
 fn hable(x: f32) -> f32 {
@@ -93,8 +57,11 @@ fn hable(x: f32) -> f32 {
 }
 
 fn shown(luminance: f32) -> f32 {
+    if curve == 2u {
+        return luminance;
+    }
     let v = min(luminance * params.gain, 1e12);
-    if params.filmic == 1u {
+    if curve == 1u {
         return hable(2.0 * min(v, params.white)) / hable(2.0 * params.white);
     }
     return v * (1.0 + v / (params.white * params.white)) / (1.0 + v);
@@ -111,14 +78,14 @@ fn decode(v: vec3f) -> vec3f {
 
 // Linear Rec. 709 for the screen, 1 is white; w is 1 where the curve ends at white, -1 where it ends at black.
 fn tone(linear: vec3f) -> vec4f {
-    let own = max(params.matrix[0].xyz * linear.r + params.matrix[1].xyz * linear.g + params.matrix[2].xyz * linear.b, vec3f(0.0));
+    let own = max(linear, vec3f(0.0));
     let y = dot(own, vec3f(0.2126, 0.7152, 0.0722));
     let s = shown(y);
     if !(y > 0.0 && s > 0.0) {
         return vec4f(0.0, 0.0, 0.0, -1.0);
     }
     var ratio = own / y;
-    if params.saturation != 1.0 {
+    if !saturated {
         ratio = pow(ratio, vec3f(params.saturation));
     }
     var rgb = min(s, 4.0) * ratio;
@@ -148,28 +115,26 @@ fn heat(t: f32) -> vec3f {
 
 @fragment
 fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
-    let at = position.xy - params.origin;
+    let at = position.xy;
     let q = params.pan + at * params.per_pixel;
-    let left = at.x < params.split;
-    let size = select(params.b.size, params.a.size, left);
     var code = vec3f(params.background);
-    if all(q >= vec2f(0.0)) && all(q < params.frame) && size.x > 0u {
-        let toned = tone(irradiance(left, q));
+    if all(q >= vec2f(0.0)) && all(q < params.frame) {
+        let toned = tone(light(q));
         code = encode(toned.xyz);
-        if params.extremes == 1u && toned.w > 0.5 {
+        if extremes && toned.w > 0.5 {
             code = vec3f(0.9, 0.1, 0.1);
         }
-        if params.extremes == 1u && toned.w < -0.5 {
+        if extremes && toned.w < -0.5 {
             code = vec3f(0.15, 0.3, 0.95);
         }
-        if params.overlay_kind > 0u && params.overlay.size.x > 0u {
+        if overlay_kind > 0u {
             let o = params.overlay;
             let p = vec2u(clamp(floor(q * vec2f(o.size) / params.frame), vec2f(0.0), vec2f(o.size) - 1.0));
             let v = overlay[o.first + p.y * o.stride + p.x];
-            if params.overlay_kind == 1u {
+            if overlay_kind == 1u {
                 // What does not count is red.
                 code = mix(code, vec3f(0.85, 0.1, 0.15), 0.75 * (1.0 - v));
-            } else if params.overlay_kind == 2u {
+            } else if overlay_kind == 2u {
                 // chi squared: 1 is what noise explains, 16 is bright.
                 code = mix(code * 0.25, heat(0.25 * log2(max(v, 1.0))), step(1.0, v));
             } else if v > 0.5 {
@@ -179,7 +144,7 @@ fn main(@builtin(position) position: vec4f) -> @location(0) vec4f {
             }
         }
     }
-    if params.encoded == 1u {
+    if encoded {
         return vec4f(code, 1.0);
     }
     return vec4f(decode(code), 1.0);

@@ -7,7 +7,7 @@ mod linear;
 
 pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
 pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, WeightTarget};
-pub use display::{Display, DisplayParams, Place};
+pub use display::{Display, DisplayParams, Part, Place};
 pub use linear::{HALO, LinearKernels, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, partials_1d, partials_2d};
 
 use crate::gpu::Gpu;
@@ -72,13 +72,14 @@ pub const SHADERS: &[(&str, &str)] = &[
     ("cg_direction", linear::CG_DIRECTION),
     ("cg_scalars", linear::CG_SCALARS),
     ("update", linear::UPDATE),
+    ("picture", display::PICTURE),
+    ("shrink", display::SHRINK),
     ("display", display::DISPLAY),
 ];
 
 /// Sizes of the Rust mirrors of the shaders' `Params` as (shader, bytes), to be compared with what naga lays out.
 pub fn params_sizes() -> Vec<(&'static str, usize)> {
-    let display = vec![("display", size_of::<DisplayParams>())];
-    [blur::params_sizes(), data::params_sizes(), linear::params_sizes(), display].concat()
+    [blur::params_sizes(), data::params_sizes(), linear::params_sizes(), display::params_sizes()].concat()
 }
 
 /// Sizes of the Rust mirrors of the shaders' table entries as (shader, structure, bytes), likewise.

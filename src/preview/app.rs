@@ -1,12 +1,12 @@
 //! The window's state, and what its parts do to it.
 
-use super::canvas::{self, Shown, View};
+use super::canvas::{self, Canvas, Shown, Side, View};
 use super::device::Device;
 use super::session::{History, Recent, Session, Shot};
 use super::shortcuts::{self, Action};
-use super::worker::{Failure, News, Overlay, OverlayKey, OverlayKind, Picture, Ready, Request, Solved, Thumbnail, Workers};
+use super::worker::{Failure, News, Overlay, OverlayKey, OverlayKind, Picture, Ready, Request, Solved, Thumbnail, Toned, Toning, Workers};
 use super::{Chosen, Options, Program, blur, controls, export, strip, words};
-use crate::kernels::{Display, DisplayParams, Place};
+use crate::kernels::{DisplayParams, Place};
 use crate::pipeline::Estimate;
 use crate::tonemap::{Light, Operator};
 use egui::{Color32, RichText, Vec2};
@@ -31,6 +31,8 @@ pub struct Kept {
 
 /// Devices that may be lost one after the other before it is no use.
 const LOSSES: usize = 3;
+/// A toned picture's RGB is that of the screen.
+const SAME: [[f32; 4]; 3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 /// Seconds after an edit that the solver waits for the next.
 const REST: f64 = 0.35;
 
@@ -192,10 +194,19 @@ pub struct App {
     pub(super) ready: Option<Arc<Ready>>,
     pub(super) solved: Option<Arc<Solved>>,
     estimate: Option<Estimate>,
+    /// Counts what was heard of the solver: its irradiance is another each time.
+    heard: u64,
     frames: BTreeMap<usize, Picture>,
     asked_frames: BTreeSet<usize>,
     overlays: BTreeMap<OverlayKey, Overlay>,
     asked_overlays: BTreeSet<OverlayKey>,
+    /// The pictures shown, as the operator tones them that looks at surroundings.
+    tones: Vec<Toned>,
+    asked_tones: Option<Toning>,
+    /// Says that one is being computed.
+    toning: Option<String>,
+    /// The last operator that treats all pixels alike.
+    plain: Operator,
     /// Counts the solutions, for what is derived from them.
     pub(super) solutions: u64,
 
@@ -228,7 +239,7 @@ impl App {
         program: Arc<dyn Program>,
         kept: Arc<Mutex<Kept>>,
     ) -> Self {
-        render.renderer.write().callback_resources.insert(Display::new(&render.device, render.target_format));
+        render.renderer.write().callback_resources.insert(Canvas::new(&render.device, render.target_format));
         let device = Device::heard(&render.device, context);
         let (sender, inbox) = mpsc::channel();
         let ctx = context.clone();
@@ -264,10 +275,15 @@ impl App {
             ready: None,
             solved: None,
             estimate: None,
+            heard: 0,
             frames: BTreeMap::new(),
             asked_frames: BTreeSet::new(),
             overlays: BTreeMap::new(),
             asked_overlays: BTreeSet::new(),
+            tones: Vec::new(),
+            asked_tones: None,
+            toning: None,
+            plain: Operator::default(),
             solutions: 0,
             view: View::default(),
             before: Source::Merge,
@@ -408,6 +424,8 @@ impl App {
         self.asked_frames.clear();
         self.overlays.clear();
         self.asked_overlays.clear();
+        self.tones.clear();
+        self.asked_tones = None;
     }
 
     /// Exposure times that the files note.
@@ -519,6 +537,7 @@ impl App {
                         running.began = Instant::now();
                     }
                     (running.stage, running.fraction, running.divisor) = (stage, fraction, divisor);
+                    self.heard += 1;
                 }
             }
             News::Warning(serial, text) => {
@@ -531,6 +550,7 @@ impl App {
                 let (w, known) = (estimate.width, self.solved.as_ref().map_or(0, |s| s.bracket.size().0));
                 if current(serial, &self.running) && w >= known {
                     self.estimate = Some(estimate);
+                    self.heard += 1;
                 }
             }
             News::Solved(serial, solved) => {
@@ -565,6 +585,11 @@ impl App {
                     self.overlays.insert(key, overlay);
                 }
             }
+            News::Toned(Ok(toned)) => {
+                self.tones.retain(|t| t.of != toned.of);
+                self.tones.push(toned);
+            }
+            News::Toned(Err(text)) => self.say_of_solution(text, true, None),
             News::Written(outcome) => {
                 self.form.busy = false;
                 self.form.last = Some(outcome.map_err(|text| words::in_window(&text)));
@@ -593,7 +618,8 @@ impl App {
             Source::Merge => Some(ready.merge.clone()),
             Source::Result => {
                 if let Some(e) = &self.estimate {
-                    return Some(Picture { planes: e.planes.clone(), place: Place::padded(e.width, e.height, e.pad) });
+                    let place = Place::padded(e.width, e.height, e.pad);
+                    return Some(Picture { planes: e.planes.clone(), place, version: self.heard });
                 }
                 Some(self.solved.as_ref().map_or_else(|| ready.merge.clone(), |s| s.picture.clone()))
             }
@@ -630,27 +656,61 @@ impl App {
     fn shown(&mut self, background: f32) -> Option<Shown> {
         let ready = self.ready.clone()?;
         let operator = Operator::parse(&self.session.look.words()).unwrap_or_default();
-        let curve = operator.curve(&self.light()?)?;
-        let m = &ready.opened.to_display;
-        let column = |c: usize| [m[0][c] as f32, m[1][c] as f32, m[2][c] as f32, 0.0];
+        let light = self.light()?;
+        let local = operator.curve(&light).is_none();
+        if !local {
+            self.plain = operator.clone();
+        }
+        // Until the other is there.
+        let curve = self.plain.curve(&light)?;
         let overlay = self.overlay_picture();
-        let (a, b) = (self.picture(self.before), self.picture(self.after));
-        Some(Shown {
-            params: DisplayParams {
-                matrix: [column(0), column(1), column(2)],
-                gain: curve.gain,
-                white: curve.white,
-                saturation: curve.saturation,
-                filmic: u32::from(curve.filmic),
-                overlay_kind: overlay.as_ref().map_or(0, |o| o.1),
-                extremes: u32::from(self.extremes),
-                background,
-                ..DisplayParams::default()
-            },
-            a,
-            b,
-            overlay: overlay.map(|o| o.0),
-        })
+        // Half precision is finest about 1.
+        let (m, unit) = (&ready.opened.to_display, ready.light.middle);
+        let column = |c: usize| [m[0][c], m[1][c], m[2][c], 0.0].map(|v| v as f32 / unit);
+        let matrix = [column(0), column(1), column(2)];
+        let pictures = [self.before, self.after].map(|source| self.picture(source));
+        self.toning = local.then(|| self.tone(&operator, &pictures, &ready)).flatten();
+        let sides = pictures.map(|picture| {
+            let picture = picture?;
+            // Toned with other parameters it is still closer than what treats all pixels alike.
+            let toned = self.tones.iter().find(|t| local && t.of == picture && t.operator.name() == operator.name());
+            Some(match toned {
+                Some(toned) => Side { picture: toned.picture.clone(), matrix: SAME, curve: 2 },
+                None => Side { picture, matrix, curve: u32::from(curve.filmic) },
+            })
+        });
+        let params = DisplayParams {
+            gain: curve.gain * unit,
+            white: curve.white,
+            saturation: curve.saturation,
+            overlay_kind: overlay.as_ref().map_or(0, |o| o.1),
+            extremes: self.extremes,
+            background,
+            ..DisplayParams::default()
+        };
+        Some(Shown { params, sides, overlay: overlay.map(|o| o.0) })
+    }
+
+    /// Asks for those of `pictures` that are not toned by `operator` yet; says so where there are any.
+    fn tone(&mut self, operator: &Operator, pictures: &[Option<Picture>; 2], ready: &Ready) -> Option<String> {
+        let shown: Vec<&Picture> = pictures.iter().flatten().collect();
+        self.tones.retain(|t| shown.contains(&&t.of));
+        // What the solver works on is another before it could be toned.
+        let (still, changing): (Vec<&Picture>, Vec<&Picture>) = shown.into_iter().partition(|p| p.version == 0);
+        let done = |p: &Picture| self.tones.iter().any(|t| t.of == *p && t.operator == *operator);
+        let mut wanted: Vec<Picture> = still.into_iter().filter(|p| !done(p)).cloned().collect();
+        wanted.dedup();
+        let name = operator.name();
+        if wanted.is_empty() {
+            return (!changing.is_empty()).then(|| format!("{name} follows when it is solved; until then {}", self.plain.name()));
+        }
+        let asked = self.asked_tones.as_ref().is_some_and(|a| a.operator == *operator && wanted.iter().all(|p| a.pictures.contains(p)));
+        if !asked {
+            let toning = Toning { operator: operator.clone(), pictures: wanted, to_display: ready.opened.to_display };
+            self.asked_tones = Some(toning.clone());
+            self.workers.tone(toning);
+        }
+        Some(format!("{name} is being computed ..."))
     }
 
     pub(super) fn source_name(&self, source: Source) -> String {
@@ -772,7 +832,21 @@ impl App {
         }
     }
 
-    fn show_messages(&mut self, ui: &mut egui::Ui) {
+    /// Floats over the upper edge of the view `rect`, which stays where it is.
+    fn show_messages(&mut self, ui: &egui::Ui, rect: egui::Rect) {
+        if self.messages.is_empty() {
+            return;
+        }
+        // Below what names the pictures.
+        let place = rect.shrink2(Vec2::new(8.0, 0.0)).with_min_y(rect.top() + 44.0);
+        let area = egui::Area::new(egui::Id::unique("messages")).fixed_pos(place.min).constrain_to(rect);
+        area.show(ui.ctx(), |ui| {
+            ui.set_width(place.width());
+            self.messages_in(ui);
+        });
+    }
+
+    fn messages_in(&mut self, ui: &mut egui::Ui) {
         let (mut gone, mut offered) = (None, None);
         for (i, message) in self.messages.iter().enumerate() {
             let (fill, sign) =
@@ -812,8 +886,9 @@ impl App {
         let (rect, response) = ui.allocate_exact_size(ui.available_size(), egui::Sense::click_and_drag());
         response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Image, true, "Main view"));
         let dark = ui.visuals().dark_mode;
-        ui.painter().rect_filled(rect, 0.0, if dark { Color32::from_gray(18) } else { Color32::from_gray(200) });
+        let background = if dark { Color32::from_gray(18) } else { Color32::from_gray(200) };
         let Some(size) = self.size() else {
+            ui.painter().rect_filled(rect, 0.0, background);
             let text = if self.session.shots.is_empty() {
                 "Drop the frames of a bracket here, or open them (Ctrl+O)".to_string()
             } else {
@@ -836,9 +911,12 @@ impl App {
             let inside = q.x >= 0.0 && q.y >= 0.0 && q.x < size.x && q.y < size.y;
             inside.then_some((q.x as usize, q.y as usize))
         });
-        if let Some(shown) = self.shown(if dark { 18.0 / 255.0 } else { 200.0 / 255.0 }) {
-            let split = if self.view.divided { self.view.split } else { 0.0 };
-            canvas::draw(ui, &layout, size, split, shown);
+        match self.shown(f32::from(background.r()) / 255.0) {
+            Some(shown) => {
+                let split = if self.view.divided { self.view.split } else { 0.0 };
+                canvas::draw(ui, &layout, size, split, shown);
+            }
+            None => drop(ui.painter().rect_filled(rect, 0.0, background)),
         }
         if self.blur.open {
             blur::over_picture(self, ui, &response, &layout);
@@ -848,6 +926,11 @@ impl App {
             canvas::tag(ui, rect, egui::Align2::LEFT_TOP, &self.source_name(self.before));
         }
         canvas::tag(ui, rect, egui::Align2::RIGHT_TOP, &self.source_name(self.after));
+        if let Some(sign) = &self.toning {
+            let place = canvas::tag(ui, rect, egui::Align2::RIGHT_BOTTOM, sign);
+            let response = ui.interact(place, ui.scope_id().with("toning"), egui::Sense::hover());
+            response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Label, true, sign));
+        }
         Some(layout)
     }
 
@@ -919,6 +1002,10 @@ impl App {
 }
 
 impl eframe::App for App {
+    fn clear_color(&self, visuals: &egui::Visuals) -> [f32; 4] {
+        visuals.panel_fill.to_normalized_gamma_f32()
+    }
+
     fn logic(&mut self, ctx: &egui::Context, _frame: &mut eframe::Frame) {
         self.think(ctx);
     }
@@ -976,8 +1063,10 @@ impl App {
         let layout = egui::CentralPanel::default()
             .frame(egui::Frame::new())
             .show(ui, |ui| {
-                self.show_messages(ui);
-                self.main_view(ui)
+                let rect = ui.available_rect_before_wrap();
+                let layout = self.main_view(ui);
+                self.show_messages(ui, rect);
+                layout
             })
             .inner;
         export::window(self, ui.ctx());

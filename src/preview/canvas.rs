@@ -1,9 +1,10 @@
 //! The main view: zoom, pan, divider, and the picture itself, drawn on the GPU.
 
 use super::worker::{Overlay, Picture};
-use crate::kernels::{Channels, Display, DisplayParams};
+use crate::kernels::{Display, DisplayParams, Part};
 use egui::{Color32, Pos2, Rect, Sense, Vec2};
 use egui_wgpu::CallbackResources;
+use std::ops::Range;
 
 /// What the view looks at.
 #[derive(Clone, Debug)]
@@ -133,58 +134,137 @@ impl View {
     }
 }
 
-/// A name on the picture.
-pub fn tag(ui: &egui::Ui, rect: Rect, align: egui::Align2, text: &str) {
+/// A name on the picture; returns where it is.
+pub fn tag(ui: &egui::Ui, rect: Rect, align: egui::Align2, text: &str) -> Rect {
     let painter = ui.painter_at(rect);
     let galley = painter.layout_no_wrap(text.into(), egui::FontId::proportional(13.0), Color32::WHITE);
     let place = align.align_size_within_rect(galley.size() + Vec2::new(16.0, 8.0), rect.shrink(8.0));
     painter.rect_filled(place, 4.0, Color32::from_black_alpha(170));
     painter.galley(place.min + Vec2::new(8.0, 4.0), galley, Color32::WHITE);
+    place
+}
+
+/// What one side of the divider shows, and by which curve.
+#[derive(Clone, PartialEq)]
+pub struct Side {
+    /// The picture.
+    pub picture: Picture,
+    /// Columns: its RGB to Rec. 709, such that the middle of its light is near 1.
+    pub matrix: [[f32; 4]; 3],
+    /// As [`DisplayParams::curve`].
+    pub curve: u32,
 }
 
 /// What is drawn in a frame of the window.
 pub struct Shown {
-    /// Parameters; place, pan and pictures are filled in.
+    /// Parameters; place and curve are filled in.
     pub params: DisplayParams,
-    /// Left of the divider.
-    pub a: Option<Picture>,
-    /// Right of it.
-    pub b: Option<Picture>,
+    /// Left of the divider, and right of it.
+    pub sides: [Option<Side>; 2],
     /// Over both.
     pub overlay: Option<Overlay>,
 }
 
-struct Draw {
+/// Everything that the pixels of the view depend on.
+#[derive(Clone, PartialEq)]
+struct Drawing {
+    /// Pixels.
+    size: [u32; 2],
+    /// Columns left of the divider.
+    split: u32,
     params: DisplayParams,
-    a: Option<Channels>,
-    b: Option<Channels>,
-    overlay: Option<wgpu::Buffer>,
+    sides: [Option<Side>; 2],
+    overlay: Option<Overlay>,
 }
 
-/// What [`Draw`] has bound for this frame.
-struct Bound(wgpu::BindGroup);
+/// What the view is drawn with, and what was drawn: pictures are converted when they change, the view is drawn when anything of it
+/// changes, and otherwise copied.
+pub struct Canvas {
+    display: Display,
+    /// The pictures of the two sides, to be sampled.
+    pictures: Vec<(Picture, wgpu::Texture)>,
+    view: Option<(Drawing, wgpu::Texture)>,
+    placed: Option<wgpu::BindGroup>,
+    /// How often a picture was converted.
+    pub conversions: usize,
+    /// How often the view was drawn.
+    pub drawings: usize,
+}
 
-impl egui_wgpu::CallbackTrait for Draw {
+impl Canvas {
+    /// For a window of `format`.
+    pub fn new(device: &wgpu::Device, format: wgpu::TextureFormat) -> Self {
+        let display = Display::new(device, format);
+        Self { display, pictures: Vec::new(), view: None, placed: None, conversions: 0, drawings: 0 }
+    }
+
+    fn convert(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, side: &Side) {
+        let Picture { planes, place, version } = &side.picture;
+        let known = self.pictures.iter_mut().find(|(p, _)| p.planes == *planes && p.place == *place);
+        let room = match known {
+            Some((known, _)) if known.version == *version => return,
+            Some((known, room)) => {
+                known.version = *version;
+                room
+            }
+            None => {
+                let room = self.display.room(device, place);
+                &self.pictures.push_mut((side.picture.clone(), room)).1
+            }
+        };
+        self.display.picture(device, encoder, planes, place, &side.matrix, room);
+        self.conversions += 1;
+    }
+
+    fn draw(&mut self, device: &wgpu::Device, encoder: &mut wgpu::CommandEncoder, drawing: &Drawing) {
+        let sides = drawing.sides.each_ref().map(Option::as_ref);
+        self.pictures.retain(|(p, _)| sides.iter().flatten().any(|s| s.picture.planes == p.planes && s.picture.place == p.place));
+        for side in sides.into_iter().flatten() {
+            self.convert(device, encoder, side);
+        }
+        let room = self.view.take().map(|v| v.1).filter(|t| [t.width(), t.height()] == drawing.size);
+        let view = room.unwrap_or_else(|| self.display.view(device, drawing.size));
+        let part = |i: usize, columns: Range<u32>| {
+            let found = sides[i].and_then(|s| self.pictures.iter().find(|(p, _)| *p == s.picture));
+            let params = DisplayParams { curve: sides[i].map_or(0, |s| s.curve), ..drawing.params };
+            Part { columns, params, picture: found.map(|f| &f.1) }
+        };
+        let parts = [part(0, 0..drawing.split), part(1, drawing.split..drawing.size[0])];
+        self.display.draw(device, encoder, &view, &parts, drawing.overlay.as_ref().map(|o| &o.plane));
+        self.drawings += 1;
+        self.view = Some((drawing.clone(), view));
+    }
+}
+
+/// The view, where it lies in the window.
+struct Placed {
+    origin: [u32; 2],
+    drawing: Drawing,
+}
+
+impl egui_wgpu::CallbackTrait for Placed {
     fn prepare(
         &self,
         device: &wgpu::Device,
-        queue: &wgpu::Queue,
+        _queue: &wgpu::Queue,
         _screen: &egui_wgpu::ScreenDescriptor,
-        _encoder: &mut wgpu::CommandEncoder,
+        encoder: &mut wgpu::CommandEncoder,
         resources: &mut CallbackResources,
     ) -> Vec<wgpu::CommandBuffer> {
-        let bound = resources
-            .get::<Display>()
-            .map(|d| Bound(d.bind(device, queue, &self.params, self.a.as_ref(), self.b.as_ref(), self.overlay.as_ref())));
-        if let Some(bound) = bound {
-            resources.insert(bound);
+        if let Some(canvas) = resources.get_mut::<Canvas>() {
+            if canvas.view.as_ref().is_none_or(|v| v.0 != self.drawing) {
+                canvas.draw(device, encoder, &self.drawing);
+            }
+            canvas.placed = canvas.view.as_ref().map(|v| canvas.display.placed(device, &v.1, self.origin));
         }
         Vec::new()
     }
 
     fn paint(&self, _info: egui::PaintCallbackInfo, pass: &mut wgpu::RenderPass<'static>, resources: &CallbackResources) {
-        if let (Some(display), Some(bound)) = (resources.get::<Display>(), resources.get::<Bound>()) {
-            display.draw(pass, &bound.0);
+        if let Some(canvas) = resources.get::<Canvas>()
+            && let Some(placed) = &canvas.placed
+        {
+            canvas.display.copy(pass, placed);
         }
     }
 }
@@ -192,21 +272,24 @@ impl egui_wgpu::CallbackTrait for Draw {
 /// Draws `shown` where `layout` says.
 pub fn draw(ui: &egui::Ui, layout: &Layout, size: Vec2, split: f32, shown: Shown) {
     let per_point = ui.ctx().pixels_per_point();
-    let origin = (layout.rect.min.to_vec2() * per_point).round();
+    let pixel = |p: Pos2| [p.x, p.y].map(|v| (v * per_point).round().max(0.0) as u32);
+    let (origin, end) = (pixel(layout.rect.min), pixel(layout.rect.max));
+    let extent = [end[0].saturating_sub(origin[0]), end[1].saturating_sub(origin[1])];
+    if extent.contains(&0) {
+        return;
+    }
     // Pixels of the frame begin where pixels of the screen do.
     let per_pixel = 1.0 / (layout.zoom * per_point);
     let pan = if per_pixel <= 1.0 { (layout.pan / per_pixel).round() * per_pixel } else { layout.pan };
     let params = DisplayParams {
-        origin: [origin.x, origin.y],
         pan: [pan.x, pan.y],
         frame: [size.x, size.y],
         per_pixel,
-        split: split * layout.rect.width() * per_point,
-        a: shown.a.as_ref().map(|p| p.place).unwrap_or_default(),
-        b: shown.b.as_ref().map(|p| p.place).unwrap_or_default(),
-        overlay: shown.overlay.as_ref().map(|p| p.place).unwrap_or_default(),
+        overlay: shown.overlay.as_ref().map(|o| o.place).unwrap_or_default(),
         ..shown.params
     };
-    let draw = Draw { params, a: shown.a.map(|p| p.planes), b: shown.b.map(|p| p.planes), overlay: shown.overlay.map(|o| o.plane) };
-    ui.painter().add(egui_wgpu::Callback::new_paint_callback(layout.rect, draw));
+    // Left are the pixels whose centres are.
+    let split = ((split * layout.rect.width() * per_point - 0.5).ceil().max(0.0) as u32).min(extent[0]);
+    let drawing = Drawing { size: extent, split, params, sides: shown.sides, overlay: shown.overlay };
+    ui.painter().add(egui_wgpu::Callback::new_paint_callback(layout.rect, Placed { origin, drawing }));
 }

@@ -11,11 +11,16 @@ use crate::tonemap::Operator;
 use crate::tsf::Model;
 use egui::{Color32, Pos2, RichText, Slider, Stroke, Vec2};
 
+/// A panel on the colour that the window is cleared to: filling it takes a software rasteriser as long as everything on it.
+pub fn bare(ui: &egui::Ui) -> egui::Frame {
+    egui::Frame::side_top_panel(ui.style()).fill(Color32::TRANSPARENT)
+}
+
 /// The menu; returns what was chosen.
 pub fn menu(app: &mut App, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec<Action> {
     let mut chosen = Vec::new();
     let mut open = None;
-    egui::Panel::top("menu").show(ui, |ui| {
+    egui::Panel::top("menu").frame(bare(ui)).show(ui, |ui| {
         egui::MenuBar::new().ui(ui, |ui| {
             let mut item = |ui: &mut egui::Ui, text: &str, action: Action, enabled: bool| {
                 let button = egui::Button::new(text).shortcut_text(shortcuts::name(ui.ctx(), action));
@@ -96,7 +101,7 @@ fn heading(ui: &mut egui::Ui, text: &str) {
 
 /// The panel.
 pub fn panel(app: &mut App, ui: &mut egui::Ui) {
-    egui::Panel::right("panel").default_size(300.0).size_range(260.0..=460.0).show(ui, |ui| {
+    egui::Panel::right("panel").frame(bare(ui)).default_size(300.0).size_range(260.0..=460.0).show(ui, |ui| {
         egui::ScrollArea::vertical().auto_shrink([false, false]).show(ui, |ui| {
             ui.spacing_mut().slider_width = 130.0;
             if app.blur.open {
@@ -152,12 +157,16 @@ fn look(app: &mut App, ui: &mut egui::Ui) {
     let look = &mut app.session.look;
     ui.add(Slider::new(&mut look.exposure, -6.0..=6.0).text("Exposure, EV").step_by(0.05));
     egui::ComboBox::from_label("Tone curve").width(110.0).selected_text(look.curve.clone()).show_ui(ui, |ui| {
-        for name in ["filmic", "reinhard"] {
-            ui.selectable_value(&mut look.curve, name.to_string(), name);
+        for name in Operator::names() {
+            if ui.selectable_label(look.curve == name, name).clicked() {
+                look.choose(name);
+            }
         }
     });
     ui.add(Slider::new(&mut look.saturation, 0.0..=2.0).text("Saturation").step_by(0.01));
-    ui.add(Slider::new(&mut look.key, 0.02..=0.6).text("Brightness of the middle").step_by(0.005));
+    let keyed = look.has_key();
+    let key = Slider::new(&mut look.key, 0.02..=0.6).text("Brightness of the middle").step_by(0.005);
+    ui.add_enabled(keyed, key);
     if ui.button("Reset the look").clicked() {
         *look = super::session::Look::default();
     }

@@ -7,7 +7,7 @@
 
 pub mod app;
 pub mod blur;
-mod canvas;
+pub mod canvas;
 mod controls;
 mod device;
 mod export;
@@ -112,7 +112,12 @@ pub fn setup() -> egui_wgpu::WgpuSetup {
         gpu::rank(&mut able);
         able.into_iter().next().ok_or_else(|| "no GPU adapter can draw on this screen; install its driver".into())
     }));
-    setup.device_descriptor = Arc::new(gpu::device_descriptor);
+    setup.device_descriptor = Arc::new(|adapter: &wgpu::Adapter| {
+        let mut descriptor = gpu::device_descriptor(adapter);
+        // Pictures are textures while they are drawn.
+        descriptor.required_limits.max_texture_dimension_2d = adapter.limits().max_texture_dimension_2d;
+        descriptor
+    });
     setup.into()
 }
 

@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::io;
 use crate::io::output::Output;
+use crate::tonemap::Operator;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -96,13 +97,13 @@ impl Default for Parameters {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Look {
-    /// `filmic` or `reinhard`.
+    /// Name of the operator.
     pub curve: String,
     /// EV added to the automatic exposure.
     pub exposure: f32,
     /// 1 keeps the colours.
     pub saturation: f32,
-    /// Luminance of the middle of the picture.
+    /// Luminance of the middle of the picture, where the operator has such a parameter.
     pub key: f32,
 }
 
@@ -115,7 +116,22 @@ impl Default for Look {
 impl Look {
     /// In the words of `--tonemap`.
     pub fn words(&self) -> String {
-        format!("{}:exposure={},saturation={},key={}", self.curve, self.exposure, self.saturation, self.key)
+        let key = if self.has_key() { format!(",key={}", self.key) } else { String::new() };
+        format!("{}:exposure={},saturation={}{key}", self.curve, self.exposure, self.saturation)
+    }
+
+    /// Whether the operator knows a luminance of the middle.
+    pub fn has_key(&self) -> bool {
+        Operator::parse(&self.curve).is_ok_and(|o| o.parameter("key").is_some())
+    }
+
+    /// Another operator, whose colours are its own unless they were chosen.
+    pub fn choose(&mut self, name: &str) {
+        let usual = |name: &str| Operator::parse(name).ok().and_then(|o| o.parameter("saturation"));
+        if usual(&self.curve) == Some(self.saturation) {
+            self.saturation = usual(name).unwrap_or(self.saturation);
+        }
+        self.curve = name.into();
     }
 }
 

@@ -1,6 +1,7 @@
 //! The strip of thumbnails, and the line of state below it.
 
 use super::app::{App, Source};
+use super::controls::bare;
 use egui::{Color32, RichText, Vec2};
 
 /// Height of a thumbnail in points.
@@ -58,7 +59,7 @@ pub fn strip(app: &mut App, ui: &mut egui::Ui) {
     if app.session.shots.is_empty() {
         return;
     }
-    egui::Panel::bottom("frames").resizable(false).show(ui, |ui| {
+    egui::Panel::bottom("frames").frame(bare(ui)).resizable(false).show(ui, |ui| {
         egui::ScrollArea::horizontal().auto_shrink([false, true]).show(ui, |ui| {
             ui.horizontal(|ui| {
                 for i in 0..app.session.shots.len() {
@@ -175,7 +176,7 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
 /// What goes on, and what is under the pointer.
 pub fn status(app: &mut App, ui: &mut egui::Ui) {
     let mut cancel = false;
-    egui::Panel::bottom("status").resizable(false).show(ui, |ui| {
+    egui::Panel::bottom("status").frame(bare(ui)).resizable(false).show(ui, |ui| {
         ui.horizontal(|ui| {
             if let Some(running) = &app.running {
                 let elapsed = running.began.elapsed().as_secs_f32();

@@ -1,12 +1,12 @@
-//! What takes time, on two threads beside the window's: one solves, one does everything else. Both tell [`News`].
+//! What takes time, on three threads beside the window's: one solves, one tones, one does everything else. All tell [`News`].
 
 use super::session::Session;
 use super::{Opened, Program};
 use crate::baseline;
-use crate::colour;
+use crate::colour::{self, Matrix};
 use crate::error::Error;
 use crate::exposure::Bracket;
-use crate::gpu::{Gate, Gpu};
+use crate::gpu::{Gate, Gpu, read};
 use crate::image::{Plane, Rgb};
 use crate::io::input;
 use crate::kernels::{Channels, Place};
@@ -14,8 +14,8 @@ use crate::layers;
 use crate::mask;
 use crate::noise;
 use crate::pipeline::{self, Engine, Estimate, Event, Outcome};
-use crate::response;
-use crate::tonemap::Light;
+use crate::response::{self, Response};
+use crate::tonemap::{Light, Operator};
 use crate::tsf::{Tsf, TsfEntry, TsfFile};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -35,16 +35,18 @@ const THUMBNAIL: u32 = 224;
 pub const BINS_PER_STOP: usize = 4;
 
 /// A picture on the device, irradiance E in its planes.
-#[derive(Clone)]
+#[derive(Clone, PartialEq)]
 pub struct Picture {
     /// The planes.
     pub planes: Channels,
     /// Where in them.
     pub place: Place,
+    /// Differs when what the planes hold does.
+    pub version: u64,
 }
 
 /// A plane on the device.
-#[derive(Clone)]
+#[derive(Clone, PartialEq)]
 pub struct Overlay {
     /// Its values.
     pub plane: wgpu::Buffer,
@@ -198,6 +200,8 @@ pub enum News {
     Frame(usize, Picture),
     /// An overlay that was asked for.
     Overlay(OverlayKey, Overlay),
+    /// A picture that was asked for, toned, or why not.
+    Toned(Result<Toned, String>),
     /// Something was written, or why not.
     Written(Result<String, String>),
     /// Files were chosen in a dialog.
@@ -220,6 +224,27 @@ pub enum OverlayKind {
 /// An overlay of frame `frame` in the solution of request `serial` at one over `divisor`.
 pub type OverlayKey = (OverlayKind, usize, u64, usize);
 
+/// A request to tone pictures by an operator that looks at a pixel's surroundings.
+#[derive(Clone)]
+pub struct Toning {
+    /// The operator.
+    pub operator: Operator,
+    /// The pictures, irradiance E.
+    pub pictures: Vec<Picture>,
+    /// Their RGB to Rec. 709.
+    pub to_display: Matrix,
+}
+
+/// A picture that was toned.
+pub struct Toned {
+    /// The operator.
+    pub operator: Operator,
+    /// The picture that it was.
+    pub of: Picture,
+    /// What the screen shows, linear Rec. 709; 1 is white.
+    pub picture: Picture,
+}
+
 /// A request to solve.
 pub struct Request {
     /// Number by which news refer to it.
@@ -234,15 +259,16 @@ pub struct Request {
 
 type Task = Box<dyn FnOnce(&Gpu, &dyn Fn(News)) + Send>;
 
-/// The two threads. They end with this.
+/// The three threads. They end with this.
 pub struct Workers {
     solve: mpsc::Sender<Request>,
+    toning: mpsc::Sender<Toning>,
     tasks: mpsc::Sender<Task>,
     tell: Arc<dyn Fn(News) + Send + Sync>,
 }
 
 impl Workers {
-    /// Starts them on a device that the window draws on, to which they submit while `gate` is open; `tell` is called from both.
+    /// Starts them on a device that the window draws on, to which they submit while `gate` is open; `tell` is called from all.
     pub fn start(
         adapter: &wgpu::Adapter,
         device: &wgpu::Device,
@@ -291,13 +317,39 @@ impl Workers {
                 let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| task(&own, &|news| hear(news))));
             }
         });
-        Self { solve, tasks, tell }
+        let (toning, wanted) = mpsc::channel::<Toning>();
+        let (own, hear) = (gpu(), tell.clone());
+        std::thread::spawn(move || {
+            let mut next = wanted.recv().ok();
+            while let Some(request) = next.take() {
+                for picture in &request.pictures {
+                    // Only the latest matters.
+                    next = wanted.try_iter().last();
+                    if next.is_some() {
+                        break;
+                    }
+                    let toned = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| toned(&own, &request, picture)));
+                    let failed =
+                        || format!("tone mapping, {}: stopped on an error of its own; choose another tone curve", request.operator.name());
+                    hear(News::Toned(toned.map_or_else(|_| Err(failed()), |t| t.map_err(|e| e.to_string()))));
+                }
+                if next.is_none() {
+                    next = wanted.recv().ok();
+                }
+            }
+        });
+        Self { solve, toning, tasks, tell }
     }
 
     /// Asks for a solution.
     pub fn solve(&self, request: Request) {
         // The thread lives as long as this.
         let _ = self.solve.send(request);
+    }
+
+    /// Asks for toned pictures, in place of those that were asked for before.
+    pub fn tone(&self, toning: Toning) {
+        let _ = self.toning.send(toning);
     }
 
     /// Looks at a file.
@@ -468,7 +520,24 @@ fn light(irradiance: &Rgb, opened: &Opened) -> Light {
 fn upload(gpu: &Gpu, image: &Rgb) -> crate::error::Result<Picture> {
     let (w, h) = image.size();
     let plane = |c: usize| gpu.upload("picture", &image.0[c].data);
-    Ok(Picture { planes: [plane(0)?, plane(1)?, plane(2)?], place: Place::padded(w, h, 0) })
+    Ok(Picture { planes: [plane(0)?, plane(1)?, plane(2)?], place: Place::padded(w, h, 0), version: 0 })
+}
+
+fn toned(gpu: &Gpu, toning: &Toning, of: &Picture) -> crate::error::Result<Toned> {
+    let Place { size, stride, first } = of.place;
+    let [width, height] = size.map(|n| n as usize);
+    let plane = |c: usize| {
+        let values = read(gpu, &of.planes[c], (of.planes[c].size() / 4) as usize)?;
+        let rows = values[first as usize..].chunks(stride as usize).take(height);
+        Ok::<_, Error>(Plane { width, height, data: rows.flat_map(|row| &row[..width]).copied().collect() })
+    };
+    let mut image = Rgb([plane(0)?, plane(1)?, plane(2)?]);
+    colour::convert(&mut image, &toning.to_display);
+    let codes = toning.operator.apply(&image);
+    let light: [f32; 256] = std::array::from_fn(|code| Response::Srgb.inverse(0, code as f64 / 255.0) as f32);
+    let linear = |c: usize| Plane { width, height, data: codes.pixels().map(|p| light[p.0[c] as usize]).collect() };
+    let picture = upload(gpu, &Rgb([linear(0), linear(1), linear(2)]))?;
+    Ok(Toned { operator: toning.operator.clone(), of: of.clone(), picture })
 }
 
 fn thumbnail(path: &Path) -> Result<Thumbnail, String> {

@@ -155,9 +155,18 @@ impl Operator {
         Ok(operator)
     }
 
+    /// The operator's name, without its parameters.
+    pub fn name(&self) -> &'static str {
+        self.kind.name()
+    }
+
+    /// The value of a parameter; `None` where the operator has none of that name.
+    pub fn parameter(&self, name: &str) -> Option<f32> {
+        self.kind.parameters().iter().position(|p| p.0 == name).map(|i| self.values[i])
+    }
+
     fn value(&self, name: &str) -> f32 {
-        let i = self.kind.parameters().iter().position(|p| p.0 == name).expect("a parameter of this operator");
-        self.values[i]
+        self.parameter(name).expect("a parameter of this operator")
     }
 
     /// Picture of `image` (linear Rec. 709, any unit); values that are not finite or are negative show as black. The exposure is automatic:

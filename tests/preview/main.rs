@@ -7,6 +7,8 @@ mod support;
 mod parts;
 /// Undo, session files, the command line that a session is.
 mod sessions;
+/// What is drawn again and what is not, local operators, messages over the picture.
+mod smooth;
 /// Labels, clicks, keys, the divider, error messages.
 mod window;
 

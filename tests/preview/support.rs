@@ -1,5 +1,7 @@
 //! The window as egui_kittest drives it, drawn with egui_wgpu on the device that it shares with the solver.
 
+use eframe::App as _;
+use egui_kittest::kittest::Queryable;
 use egui_kittest::{Harness, TestRenderer};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -8,6 +10,7 @@ use unshaken::cli::preview::Merge;
 use unshaken::exposure::Frame;
 use unshaken::io::exif::{self, Format};
 use unshaken::preview::app::Kept;
+use unshaken::preview::canvas::Canvas;
 use unshaken::preview::{self, App, Options};
 use unshaken::synth::{self, Camera, Tremor};
 
@@ -44,11 +47,15 @@ impl Window {
     }
 
     pub fn with(options: &Options, kept: Arc<Mutex<Kept>>, pixels_per_point: f32) -> Self {
+        Self::drawn(options, kept, pixels_per_point, egui_wgpu::RendererOptions::PREDICTABLE)
+    }
+
+    /// With a renderer as the tests have it, or as the program.
+    pub fn drawn(options: &Options, kept: Arc<Mutex<Kept>>, pixels_per_point: f32, renderer: egui_wgpu::RendererOptions) -> Self {
         let setup = preview::setup();
         let instance = pollster::block_on(setup.new_instance());
         let configuration = egui_wgpu::WgpuConfiguration { wgpu_setup: setup, ..Default::default() };
-        let options_of_renderer = egui_wgpu::RendererOptions::PREDICTABLE;
-        let render = pollster::block_on(egui_wgpu::RenderState::create(&configuration, &instance, None, options_of_renderer))
+        let render = pollster::block_on(egui_wgpu::RenderState::create(&configuration, &instance, None, renderer))
             .unwrap_or_else(|e| panic!("the tests need a GPU adapter: {e}"));
         let (options, own, keep) = (options.clone(), render.clone(), kept.clone());
         let builder = Harness::builder().with_size(SIZE).with_pixels_per_point(pixels_per_point).renderer(Textures(render.clone()));
@@ -90,14 +97,16 @@ impl Window {
         self.wait("the solution", 240, |app| !app.is_busy() && app.solution().is_some_and(|s| s.divisor == 1));
     }
 
-    /// What the window shows, as pixels.
-    pub fn picture(&mut self) -> image::RgbImage {
-        self.harness.step();
+    /// Draws what the window shows.
+    pub fn draw(&self) -> wgpu::Texture {
         let (ctx, output, render) = (&self.harness.ctx, self.harness.output(), &self.render);
         let per_point = ctx.pixels_per_point();
         let size = [(SIZE.x * per_point) as u32, (SIZE.y * per_point) as u32];
         let screen = egui_wgpu::ScreenDescriptor { pixels_per_point: per_point, size_in_pixels: size };
-        let shapes = ctx.tessellate(output.shapes.clone(), per_point);
+        // Without the ground that the harness lays first: the program's window is cleared to its colour.
+        let (ground, shapes) = output.shapes.split_first().expect("the ground");
+        assert!(matches!(ground.shape, egui::Shape::Rect(_)));
+        let shapes = ctx.tessellate(shapes.to_vec(), per_point);
         let mut encoder = render.device.create_command_encoder(&Default::default());
         let mut renderer = render.renderer.write();
         let buffers = renderer.update_buffers(&render.device, &render.queue, &mut encoder, &shapes, &screen);
@@ -112,17 +121,57 @@ impl Window {
             view_formats: &[],
         });
         let view = texture.create_view(&Default::default());
+        let [r, g, b, a] = self.app().clear_color(&ctx.global_style().visuals).map(f64::from);
+        let ground = wgpu::Color { r, g, b, a };
         {
             let attachment = wgpu::RenderPassColorAttachment {
                 view: &view,
                 resolve_target: None,
-                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(wgpu::Color::BLACK), store: wgpu::StoreOp::Store },
+                ops: wgpu::Operations { load: wgpu::LoadOp::Clear(ground), store: wgpu::StoreOp::Store },
                 depth_slice: None,
             };
             let descriptor = wgpu::RenderPassDescriptor { color_attachments: &[Some(attachment)], ..Default::default() };
             let mut pass = encoder.begin_render_pass(&descriptor).forget_lifetime();
             renderer.render(&mut pass, &shapes, &screen);
         }
+        render.queue.submit(buffers.into_iter().chain([encoder.finish()]));
+        texture
+    }
+
+    /// How often a picture was converted, and how often the view was drawn.
+    pub fn counts(&self) -> (usize, usize) {
+        let renderer = self.render.renderer.read();
+        let canvas = renderer.callback_resources.get::<Canvas>().expect("made with the window");
+        (canvas.conversions, canvas.drawings)
+    }
+
+    /// Drops files on the window.
+    pub fn drop_files(&mut self, files: &[PathBuf]) {
+        let handles = files.iter().map(|f| Arc::new(Dropped(f.clone())) as egui::DroppedFileHandle);
+        self.harness.input_mut().dropped_files = handles.collect();
+    }
+
+    /// Chooses a tone curve.
+    pub fn choose_curve(&mut self, name: &str) {
+        let now = self.app().session().look.curve.clone();
+        self.harness.get_by_value(&now).click();
+        self.harness.run_steps(3);
+        self.harness.get_by_label(name).click();
+        self.harness.run_steps(2);
+    }
+
+    /// Waits for the device.
+    pub fn settle(&self) {
+        let wait = wgpu::PollType::Wait { submission_index: None, timeout: Some(Duration::from_secs(60)) };
+        self.render.device.poll(wait).expect("the device answers");
+    }
+
+    /// What the window shows, as pixels.
+    pub fn picture(&mut self) -> image::RgbImage {
+        self.harness.step();
+        let (texture, render) = (self.draw(), &self.render);
+        let size = [texture.width(), texture.height()];
+        let mut encoder = render.device.create_command_encoder(&Default::default());
         let row = (4 * size[0]).next_multiple_of(256);
         let staging = render.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("window"),
@@ -133,10 +182,9 @@ impl Window {
         let layout = wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(row), rows_per_image: None };
         let to = wgpu::TexelCopyBufferInfo { buffer: &staging, layout };
         encoder.copy_texture_to_buffer(texture.as_image_copy(), to, texture.size());
-        render.queue.submit(buffers.into_iter().chain([encoder.finish()]));
+        render.queue.submit([encoder.finish()]);
         staging.map_async(wgpu::MapMode::Read, .., |r| r.expect("the picture is mapped"));
-        let wait = wgpu::PollType::Wait { submission_index: None, timeout: Some(Duration::from_secs(60)) };
-        render.device.poll(wait).expect("the device answers");
+        self.settle();
         let bytes = staging.get_mapped_range(..).expect("mapped");
         let swapped = matches!(render.target_format, wgpu::TextureFormat::Bgra8Unorm | wgpu::TextureFormat::Bgra8UnormSrgb);
         let picture = image::RgbImage::from_fn(size[0], size[1], |x, y| {
@@ -153,6 +201,32 @@ impl Window {
     }
 }
 
+/// A file as the desktop hands it over.
+#[derive(Debug)]
+struct Dropped(PathBuf);
+
+impl egui::DroppedFile for Dropped {
+    fn path(&self) -> &Path {
+        &self.0
+    }
+
+    fn bytes(&self) -> Result<Vec<u8>, String> {
+        std::fs::read(&self.0).map_err(|e| e.to_string())
+    }
+}
+
+/// Draws until `done`, at most a minute.
+#[track_caller]
+pub fn until(window: &mut Window, what: &str, done: impl Fn(&Window) -> bool) {
+    let start = Instant::now();
+    while !done(window) {
+        assert!(start.elapsed() < Duration::from_secs(60), "{what} did not come");
+        window.harness.step();
+        std::thread::sleep(Duration::from_millis(15));
+    }
+    window.harness.run_steps(2);
+}
+
 /// How frames note their exposure time.
 #[derive(Clone, Copy, PartialEq)]
 pub enum Times {
@@ -162,7 +236,12 @@ pub enum Times {
 
 /// A small bracket: 1/15 and 1/4 s sharp, 1 s shaken.
 pub fn frames(folder: &Path, times: Times) -> Vec<PathBuf> {
-    let scene = synth::room(128, 96, 24, 3);
+    sized_frames(folder, times, (128, 96))
+}
+
+/// The same at a size.
+pub fn sized_frames(folder: &Path, times: Times, (width, height): (usize, usize)) -> Vec<PathBuf> {
+    let scene = synth::room(width, height, 24, 3);
     let shake = Tremor { extent_px: 5.0, roll_deg: 0.3, offset_px: 0.5, offset_deg: 0.0 };
     let wanted = [(1.0 / 15.0, None), (0.25, None), (1.0, Some(shake))];
     let made = synth::capture(&scene, &Camera::default(), &wanted, 0.08, 5).expect("a bracket");

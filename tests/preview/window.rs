@@ -1,7 +1,7 @@
-use super::support::{SIZE, Times, Window, frames};
+use super::support::{SIZE, Times, Window, frames, until};
 use egui::{Key, Modifiers, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -36,20 +36,6 @@ fn an_empty_window_says_what_to_do() {
     assert!(window.harness.query_by_label("Half a stop brighter").is_none(), "Escape closes the sheet");
 }
 
-/// A file as the desktop hands it over.
-#[derive(Debug)]
-struct Dropped(PathBuf);
-
-impl egui::DroppedFile for Dropped {
-    fn path(&self) -> &Path {
-        &self.0
-    }
-
-    fn bytes(&self) -> Result<Vec<u8>, String> {
-        std::fs::read(&self.0).map_err(|e| e.to_string())
-    }
-}
-
 /// Moves the pointer from `from` to `to` with the button held.
 fn drag(window: &mut Window, from: Pos2, to: Pos2) {
     window.harness.hover_at(from);
@@ -80,7 +66,7 @@ fn frames_are_dropped_probed_zoomed_and_moved() {
     let (_folder, files) = bracket();
     let mut window = Window::open(&[]);
     window.harness.run_steps(2);
-    window.harness.input_mut().dropped_files = files.iter().map(|f| Arc::new(Dropped(f.clone())) as egui::DroppedFileHandle).collect();
+    window.drop_files(&files);
     window.harness.run_steps(2);
     assert_eq!(window.app().session().shots.len(), 3, "dropped");
     window.solve();
@@ -182,16 +168,31 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     let shown = window.picture();
     let solved = window.app().solution().expect("solved").clone();
     let time = solved.bracket.frames()[solved.outcome.reference].exposure_time as f32;
-    let wanted = Operator::default().apply(&solved.outcome.irradiance.map_planes(|p| p.map(|v| v / time)));
-    let (w, h) = (wanted.width() as i64, wanted.height() as i64);
+    let irradiance = solved.outcome.irradiance.map_planes(|p| p.map(|v| v / time));
+    let (w, h) = (irradiance.size().0 as i64, irradiance.size().1 as i64);
     let pan = (0.5 * Vec2::new(w as f32, h as f32) - 0.5 * view.size()).round();
     let (x0, y0) = ((view.left().round() - pan.x) as i64, (view.top().round() - pan.y) as i64);
-    let mut far = 0;
-    for (x, y, p) in wanted.enumerate_pixels() {
-        let q = shown.get_pixel((x0 + i64::from(x)) as u32, (y0 + i64::from(y)) as u32);
-        far += usize::from((0..3).any(|c| p.0[c].abs_diff(q.0[c]) > 2));
+    // Pixels of `shown` that are more than `most` codes from what the operator makes.
+    let far = |shown: &image::RgbImage, operator: &Operator, most: u8| {
+        let wanted = operator.apply(&irradiance);
+        let differs = |(x, y, p): (u32, u32, &image::Rgb<u8>)| {
+            let q = shown.get_pixel((x0 + i64::from(x)) as u32, (y0 + i64::from(y)) as u32);
+            (0..3).any(|c| p.0[c].abs_diff(q.0[c]) > most)
+        };
+        wanted.enumerate_pixels().filter(|p| differs(*p)).count()
+    };
+    let found = far(&shown, &Operator::default(), 2);
+    assert!(found < (w * h / 200) as usize, "{found} of {} pixels differ by more than rounding", w * h);
+    // So it is where an operator looks at surroundings, once it is computed: what it made is what is shown.
+    for name in ["reinhard-local", "durand", "fattal"] {
+        window.choose_curve(name);
+        until(&mut window, name, |w| w.harness.query_by_label_contains("being computed").is_none());
+        let operator = Operator::parse(&window.app().session().look.words()).unwrap();
+        assert_eq!(operator.name(), name);
+        let found = far(&window.picture(), &operator, 1);
+        assert!(found < (w * h / 200) as usize, "{name}: {found} of {} pixels differ by more than rounding", w * h);
     }
-    assert!(far < (w * h / 200) as usize, "{far} of {} pixels differ by more than rounding", w * h);
+    window.choose_curve("filmic");
 
     // Exposure acts without solving.
     let (before, serial) = (shown.clone(), Arc::as_ptr(&solved));
@@ -265,7 +266,8 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     window.harness.key_press(Key::B);
     window.harness.run_steps(3);
 
-    // Export: what `merge` makes of the command line is the same, byte for byte.
+    // Export: what `merge` makes of the command line is the same, byte for byte; the picture as well, whatever its operator.
+    window.choose_curve("durand");
     let target = folder.path().join("seen.exr");
     window.harness.key_press_modifiers(Modifiers::COMMAND, Key::E);
     window.harness.run_steps(3);
@@ -296,9 +298,20 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     }
 
     let own = folder.path().join("headless.exr");
-    let line = window.app().session().arguments(&[None; 3], &own);
-    let run = Command::new(env!("CARGO_BIN_EXE_unshaken")).args(["merge", "--quiet"]).args(line).output().unwrap();
+    let program = env!("CARGO_BIN_EXE_unshaken");
+    let line = window.app().session().command_line(&[None; 3], &own).replacen("unshaken merge", &format!("'{program}' merge --quiet"), 1);
+    assert!(line.contains("--tonemap=durand:"), "{line}");
+    let run = Command::new("sh").args(["-c", &line]).output().unwrap();
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let picture = |path: &Path| image::open(path.with_extension("png")).unwrap().into_rgb8();
+    assert!(picture(&target) == picture(&own), "the window's picture and the command line's");
+    // And what `tonemap` makes of the linear result.
+    let toned = folder.path().join("toned.png");
+    let words = window.app().session().look.words();
+    let run = Command::new(program).args(["tonemap", "--quiet", "--tonemap", &words, "-o"]).args([&toned, &target]).output().unwrap();
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let most = picture(&toned).as_raw().iter().zip(picture(&target).as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(most <= Some(1), "{most:?} codes");
     let (seen, headless) = (pixels(&target), pixels(&own));
     assert_eq!(seen, headless, "the window's result and the command line's");
 }

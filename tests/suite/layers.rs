@@ -133,6 +133,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "kernels::Channels",
             "kernels::Display",
             "kernels::DisplayParams",
+            "kernels::Part",
             "kernels::Place",
             "tsf::Model",
             "tsf::Tsf",

@@ -20,6 +20,8 @@ mod cli;
 mod collaborative;
 /// The demo's bracket and its before/after picture.
 mod demo;
+/// Pictures on a target: what a pixel of the screen shows of those of the frame.
+mod display;
 /// The paper's experiments, tiny.
 mod experiments;
 mod faults;
