@@ -704,15 +704,19 @@ impl<'a> Solver<'a> {
         steps
     }
 
-    /// Sum of scalar `slot` over some channels.
-    fn scalar(&self, group: &Range<usize>, slot: usize) -> Result<f64> {
-        let scalars = gpu::read(self.gpu, &self.state.scalars, SCALARS)?;
-        Ok(group.clone().map(|c| f64::from(scalars[SLOTS * c + slot])).sum())
+    fn scalars(&self) -> Result<Vec<f64>> {
+        Ok(gpu::read(self.gpu, &self.state.scalars, SCALARS)?.into_iter().map(f64::from).collect())
+    }
+
+    /// ⟨r, z⟩ of some channels together.
+    fn energy(&self, group: &Range<usize>) -> Result<f64> {
+        let scalars = self.scalars()?;
+        Ok(group.clone().map(|c| scalars[SLOTS * c + SLOT_ENERGY]).sum())
     }
 
     fn objective(&self) -> Result<f64> {
-        let smoothness = gpu::read(self.gpu, &self.state.scalars, SCALARS)?[SLOT_SMOOTHNESS];
-        Ok(self.scalar(&(0..3), SLOT_DATA)? + f64::from(smoothness))
+        let scalars = self.scalars()?;
+        Ok((0..3).map(|c| scalars[SLOTS * c + SLOT_DATA]).sum::<f64>() + scalars[SLOT_SMOOTHNESS])
     }
 
     fn run(&self, progress: &mut dyn FnMut(f32) -> bool) -> Result<Solution> {
@@ -738,19 +742,19 @@ impl<'a> Solver<'a> {
             let (mut energy, mut left) = (0.0, 0.0);
             for (number, (group, start, iteration)) in systems.iter().enumerate() {
                 self.gpu.submit(start);
-                energy += self.scalar(group, SLOT_ENERGY)?;
+                energy += self.energy(group)?;
                 for i in 0..set.inner {
                     self.gpu.submit(iteration);
                     // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
                     if i % 5 == 4 || i + 1 == set.inner {
-                        self.scalar(group, SLOT_ENERGY)?;
+                        self.energy(group)?;
                         let done = (number as f32 + (i + 1) as f32 / set.inner as f32) / systems.len() as f32;
                         if !progress(ITERATING * (outer as f32 + done) / set.outer as f32) {
                             return Err(Error::Cancelled);
                         }
                     }
                 }
-                left += self.scalar(group, SLOT_ENERGY)?;
+                left += self.energy(group)?;
             }
             let reduction = left / energy.max(f64::MIN_POSITIVE);
             let before = self.objective()?;

@@ -73,17 +73,6 @@ impl Kernel {
             gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries });
         Step::Dispatch { pipeline: self.pipeline.clone(), bindings, groups }
     }
-
-    /// [`Kernel::step`] over an image of `size` with workgroups of 16 x 8, `depth` deep.
-    pub fn step_2d<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], size: (usize, usize), depth: usize) -> Step {
-        self.step(gpu, params, buffers, [size.0.div_ceil(16) as u32, size.1.div_ceil(8) as u32, depth as u32])
-    }
-
-    /// [`Kernel::step`] over `count` values with workgroups of 128.
-    pub fn step_1d<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], count: usize) -> Step {
-        let (row, rows) = grid_1d(count);
-        self.step(gpu, params, buffers, [row, rows, 1])
-    }
 }
 
 /// Records `steps` in order; dispatches that follow one another share a compute pass.

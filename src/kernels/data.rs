@@ -1,6 +1,6 @@
 //! Data weights and residuals of one frame: how much each pixel counts and how far the estimate is from it.
 
-use super::linear::{Part, parts};
+use super::linear::{Part, grid_2d, parts};
 use crate::gpu::{Gpu, Kernel, Rows, Step};
 use std::ops::Range;
 
@@ -158,10 +158,6 @@ impl MisfitSource<'_> {
     }
 }
 
-fn dispatch(size: (usize, usize), rows: &Range<usize>) -> [u32; 3] {
-    [size.0.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1]
-}
-
 impl DataKernels {
     /// Compiles them.
     pub fn new(gpu: &Gpu) -> Self {
@@ -191,7 +187,7 @@ impl DataKernels {
                 noise: std::array::from_fn(|i| from.noise[i]),
             };
             let [exposure, mask, sum, counted] = own.map(|r| r.binding);
-            self.misfit.step_parts(gpu, &params, &[predicted.binding, exposure, mask, sum, counted], dispatch(from.size, &rows))
+            self.misfit.step_parts(gpu, &params, &[predicted.binding, exposure, mask, sum, counted], grid_2d(from.size, &rows))
         };
         from.bands(gpu, from.size).into_iter().map(step).collect()
     }
@@ -204,7 +200,7 @@ impl DataKernels {
                 let planes = [&from.sum, &from.counted, &to.sum, &to.counted].map(|b| gpu.rows(b, size, seen.clone()));
                 let (rows_of, first) = (ints((rows.start, rows.end)), planes[0].first as i32);
                 let params = GaussParams { size: ints(size), rows: rows_of, step: direction, first, sigma: SIGMA };
-                self.gauss.step_parts(gpu, &params, &planes.map(|r| r.binding), dispatch(size, &rows))
+                self.gauss.step_parts(gpu, &params, &planes.map(|r| r.binding), grid_2d(size, &rows))
             };
             gpu.bands(size.1, REACH, size).map(step).collect()
         };
@@ -238,7 +234,7 @@ impl DataKernels {
             };
             let ([exposure, mask, sum, counted], [weight, observation]) = (own.map(|r| r.binding), out.map(|r| r.binding));
             let bound = [predicted.binding, exposure, mask, sum, counted, weight, observation];
-            self.weights.step_parts(gpu, &params, &bound, dispatch(from.size, &rows))
+            self.weights.step_parts(gpu, &params, &bound, grid_2d(from.size, &rows))
         };
         from.bands(gpu, to.size).into_iter().map(step).collect()
     }

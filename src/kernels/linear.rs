@@ -1,6 +1,7 @@
 //! Smoothness term, normal equations and conjugate gradients in log irradiance, one channel per step.
 
 use crate::gpu::{Gpu, Kernel, Step, grid_1d};
+use std::ops::Range;
 
 pub(super) const EDGE_WEIGHT: &str =
     concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/edge_weight.wgsl"));
@@ -124,17 +125,17 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
 
 /// Partial sums of a kernel over an image of `size`.
 pub fn partials_2d(gpu: &Gpu, size: (usize, usize)) -> usize {
-    gpu.bands(size.1, HALO, size).map(|rows| size.0.div_ceil(16) * rows.len().div_ceil(8)).sum()
+    bands(gpu, size, 0).iter().map(Band::partials).sum()
 }
 
 /// Partial sums of a kernel over `count` values.
 pub fn partials_1d(gpu: &Gpu, count: usize) -> usize {
-    gpu.parts(count, GROUP).map(|part| groups_1d(part.len())).sum()
+    parts(gpu, count, 0).iter().map(Part::partials).sum()
 }
 
-fn groups_1d(count: usize) -> usize {
-    let (row, rows) = grid_1d(count);
-    row as usize * rows as usize
+/// Workgroups of 16 x 8 for the rows `rows` of an image of `size`.
+pub(super) fn grid_2d(size: (usize, usize), rows: &Range<usize>) -> [u32; 3] {
+    [size.0.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1]
 }
 
 /// Values that a workgroup makes.
@@ -142,20 +143,23 @@ const GROUP: usize = 128;
 
 /// A part of one vector for each of the kernel's bindings.
 pub(super) struct Part {
-    values: std::ops::Range<usize>,
+    values: Range<usize>,
     /// First partial sum.
     pub partial: u32,
     /// Workgroups per row.
     pub row: u32,
+    /// Rows of workgroups.
+    rows: u32,
 }
 
 /// The parts in which `count` values can be bound, with partial sums from `partial` on.
 pub(super) fn parts(gpu: &Gpu, count: usize, partial: usize) -> Vec<Part> {
     let mut next = partial;
-    let part = |values: std::ops::Range<usize>| {
-        let partial = next as u32;
-        next += groups_1d(values.len());
-        Part { partial, row: grid_1d(values.len()).0, values }
+    let part = |values: Range<usize>| {
+        let (row, rows) = grid_1d(values.len());
+        let part = Part { values, partial: next as u32, row, rows };
+        next += part.partials();
+        part
     };
     gpu.parts(count, GROUP).map(part).collect()
 }
@@ -163,6 +167,10 @@ pub(super) fn parts(gpu: &Gpu, count: usize, partial: usize) -> Vec<Part> {
 impl Part {
     pub fn count(&self) -> u32 {
         self.values.len() as u32
+    }
+
+    fn partials(&self) -> usize {
+        self.row as usize * self.rows as usize
     }
 
     fn vector(&self, scalars: usize) -> VectorParams {
@@ -186,15 +194,13 @@ impl Part {
         let mut bound: Vec<wgpu::BufferBinding> = before.iter().map(|b| b.as_entire_buffer_binding()).collect();
         bound.extend(vectors.iter().map(|b| Gpu::part(b, &self.values)));
         bound.extend(after.iter().map(|b| b.as_entire_buffer_binding()));
-        let (row, rows) = grid_1d(self.values.len());
-        kernel.step_parts(gpu, params, &bound, [row, rows, 1])
+        kernel.step_parts(gpu, params, &bound, [self.row, self.rows, 1])
     }
 }
 
 /// Some rows of planes of one size, which all are bound from the same row on.
 struct Band {
-    rows: std::ops::Range<usize>,
-    first: i32,
+    rows: Range<usize>,
     partial: u32,
     groups: [u32; 3],
 }
@@ -202,22 +208,25 @@ struct Band {
 /// The bands in which planes of `size` can be bound, with partial sums from `partial` on.
 fn bands(gpu: &Gpu, size: (usize, usize), partial: usize) -> Vec<Band> {
     let mut next = partial;
-    let band = |rows: std::ops::Range<usize>| {
-        let groups = [size.0.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1];
-        let partial = next as u32;
-        next += (groups[0] * groups[1]) as usize;
-        Band { rows, first: 0, partial, groups }
+    let band = |rows: Range<usize>| {
+        let band = Band { groups: grid_2d(size, &rows), partial: next as u32, rows };
+        next += band.partials();
+        band
     };
     gpu.bands(size.1, HALO, size).map(band).collect()
 }
 
 impl Band {
-    /// Bindings of the band and its neighbours in `planes`; notes the row that comes first in them.
-    fn bind<'a>(&mut self, gpu: &Gpu, planes: &[&'a wgpu::Buffer], size: (usize, usize)) -> Vec<wgpu::BufferBinding<'a>> {
+    fn partials(&self) -> usize {
+        self.groups[0] as usize * self.groups[1] as usize
+    }
+
+    /// Bindings of the band and its neighbours in `planes`, and the row that comes first in them.
+    fn bind<'a>(&self, gpu: &Gpu, planes: &[&'a wgpu::Buffer], size: (usize, usize)) -> (Vec<wgpu::BufferBinding<'a>>, i32) {
         let seen = self.rows.start.saturating_sub(HALO)..(self.rows.end + HALO).min(size.1);
         let bound: Vec<_> = planes.iter().map(|b| gpu.rows(b, size, seen.clone())).collect();
-        self.first = bound[0].first as i32;
-        bound.into_iter().map(|b| b.binding).collect()
+        let first = bound[0].first as i32;
+        (bound.into_iter().map(|b| b.binding).collect(), first)
     }
 
     fn rows(&self) -> [i32; 2] {
@@ -269,13 +278,13 @@ impl LinearKernels {
         size: (usize, usize),
     ) -> Vec<Step> {
         let [r, g, b] = irradiance;
-        let step = |mut band: Band| {
-            let mut bound = band.bind(gpu, &[r, g, b, edge], size);
+        let step = |band: Band| {
+            let (mut bound, first) = band.bind(gpu, &[r, g, b, edge], size);
             bound.push(partials.as_entire_buffer_binding());
             let params = EdgeParams {
                 size: [size.0 as i32, size.1 as i32],
                 rows: band.rows(),
-                first: band.first,
+                first,
                 partial: band.partial,
                 row: band.groups[0],
                 lambda,
@@ -300,13 +309,13 @@ impl LinearKernels {
         partial: usize,
         size: (usize, usize),
     ) -> Vec<Step> {
-        let step = |mut band: Band| {
-            let mut bound = band.bind(gpu, &[irradiance, back, edge, direction, product], size);
+        let step = |band: Band| {
+            let (mut bound, first) = band.bind(gpu, &[irradiance, back, edge, direction, product], size);
             bound.push(partials.as_entire_buffer_binding());
             let params = NormalParams {
                 size: [size.0 as i32, size.1 as i32],
                 rows: band.rows(),
-                first: band.first,
+                first,
                 partial: band.partial,
                 row: band.groups[0],
                 _pad: 0,
@@ -328,9 +337,9 @@ impl LinearKernels {
         diagonal: &wgpu::Buffer,
         size: (usize, usize),
     ) -> Vec<Step> {
-        let step = |mut band: Band| {
-            let bound = band.bind(gpu, &[irradiance, back, edge, data_diagonal, right_side, diagonal], size);
-            let params = RightSideParams { size: [size.0 as i32, size.1 as i32], rows: band.rows(), first: band.first, _pad: 0 };
+        let step = |band: Band| {
+            let (bound, first) = band.bind(gpu, &[irradiance, back, edge, data_diagonal, right_side, diagonal], size);
+            let params = RightSideParams { size: [size.0 as i32, size.1 as i32], rows: band.rows(), first, _pad: 0 };
             self.right_side.step_parts(gpu, &params, &bound, band.groups)
         };
         bands(gpu, size, 0).into_iter().map(step).collect()
@@ -414,7 +423,7 @@ impl LinearKernels {
         gpu: &Gpu,
         partials: &wgpu::Buffer,
         scalars: &wgpu::Buffer,
-        channels: std::ops::Range<usize>,
+        channels: Range<usize>,
         count: usize,
         slot: usize,
         shift: bool,

@@ -1,4 +1,4 @@
-use super::support::{SIZE, Times, Window, frames, until};
+use super::support::{SIZE, Times, Window, frames};
 use egui::{Key, Vec2};
 use egui_kittest::kittest::Queryable;
 
@@ -118,13 +118,13 @@ fn a_local_operator_is_computed_beside_and_a_newer_one_replaces_it() {
     // The window goes on: the sign is there before the picture is.
     assert!(window.harness.query_by_label_contains("durand is being computed").is_some());
     window.choose_curve("fattal");
-    until(&mut window, "fattal's picture", |w| w.harness.query_by_label_contains("being computed").is_none());
+    window.wait_for_tones("fattal's picture");
     let fattal = part(&window.picture(), rect);
     assert!(fattal != filmic);
     assert_eq!(window.app().session().look.saturation, 0.75, "the operator's own colours");
     window.harness.key_press(Key::CloseBracket);
     window.harness.run_steps(3);
-    until(&mut window, "the brighter picture", |w| w.harness.query_by_label_contains("being computed").is_none());
+    window.wait_for_tones("the brighter picture");
     assert!(part(&window.picture(), rect) != fattal, "the exposure is the operator's");
     window.choose_curve("filmic");
     window.harness.key_press(Key::OpenBracket);

@@ -78,10 +78,21 @@ impl Window {
     /// Draws until `done`, at most `seconds`.
     #[track_caller]
     pub fn wait(&mut self, what: &str, seconds: u64, done: impl Fn(&App) -> bool) {
+        self.wait_for(what, seconds, |window| done(window.app()));
+    }
+
+    /// Draws until no picture is being computed.
+    #[track_caller]
+    pub fn wait_for_tones(&mut self, what: &str) {
+        self.wait_for(what, 60, |window| window.harness.query_by_label_contains("being computed").is_none());
+    }
+
+    #[track_caller]
+    fn wait_for(&mut self, what: &str, seconds: u64, done: impl Fn(&Self) -> bool) {
         let start = Instant::now();
         loop {
             self.harness.step();
-            if done(self.app()) {
+            if done(self) {
                 break;
             }
             let (texts, waited) = (self.app().texts().join("; "), start.elapsed());
@@ -213,18 +224,6 @@ impl egui::DroppedFile for Dropped {
     fn bytes(&self) -> Result<Vec<u8>, String> {
         std::fs::read(&self.0).map_err(|e| e.to_string())
     }
-}
-
-/// Draws until `done`, at most a minute.
-#[track_caller]
-pub fn until(window: &mut Window, what: &str, done: impl Fn(&Window) -> bool) {
-    let start = Instant::now();
-    while !done(window) {
-        assert!(start.elapsed() < Duration::from_secs(60), "{what} did not come");
-        window.harness.step();
-        std::thread::sleep(Duration::from_millis(15));
-    }
-    window.harness.run_steps(2);
 }
 
 /// How frames note their exposure time.

@@ -1,4 +1,4 @@
-use super::support::{SIZE, Times, Window, frames, until};
+use super::support::{SIZE, Times, Window, frames};
 use egui::{Key, Modifiers, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
 use std::path::Path;
@@ -186,7 +186,7 @@ fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     // So it is where an operator looks at surroundings, once it is computed: what it made is what is shown.
     for name in ["reinhard-local", "durand", "fattal"] {
         window.choose_curve(name);
-        until(&mut window, name, |w| w.harness.query_by_label_contains("being computed").is_none());
+        window.wait_for_tones(name);
         let operator = Operator::parse(&window.app().session().look.words()).unwrap();
         assert_eq!(operator.name(), name);
         let found = far(&window.picture(), &operator, 1);
