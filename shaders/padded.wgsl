@@ -1,6 +1,6 @@
 // A part of an image with a margin of zeros: what lies outside the image reads as 0, so that the kernels that read the copy need no
 // check of the border. (Software rasterisers run both sides of every branch.)
-// Channels that the operator works on at a time: 3, or only the first. What is not written is not read either.
+// Channels that the operator works on at a time: 3, or only the first.
 override CHANNELS: u32 = 3u;
 struct Params {
     in_size: vec2i,    // of the image
@@ -14,9 +14,7 @@ struct Params {
 @group(0) @binding(1) var<storage, read> in_r: array<f32>;
 @group(0) @binding(2) var<storage, read> in_g: array<f32>;
 @group(0) @binding(3) var<storage, read> in_b: array<f32>;
-@group(0) @binding(4) var<storage, read_write> out_r: array<f32>;
-@group(0) @binding(5) var<storage, read_write> out_g: array<f32>;
-@group(0) @binding(6) var<storage, read_write> out_b: array<f32>;
+@group(0) @binding(4) var out: texture_storage_2d<rgba32float, write>;
 
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u) {
@@ -28,12 +26,11 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     var v = vec3f(0.0);
     if inside(p, params.in_size) {
         let i = at(p - vec2i(0, params.in_first), params.in_size.x);
-        v = vec3f(in_r[i], in_g[i], in_b[i]);
+        v.x = in_r[i];
+        if CHANNELS > 1u {
+            v.y = in_g[i];
+            v.z = in_b[i];
+        }
     }
-    let i = at(o, params.out_size.x);
-    out_r[i] = v.x;
-    if CHANNELS > 1u {
-        out_g[i] = v.y;
-        out_b[i] = v.z;
-    }
+    textureStore(out, texel(at(o, params.out_size.x)), vec4f(v, 0.0));
 }

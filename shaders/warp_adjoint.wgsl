@@ -21,8 +21,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
                 let j = q - params.in_origin;
                 if abs(u.x) < f32(SUPPORT) && abs(u.y) < f32(SUPPORT) && inside(j, params.in_size) {
                     let w = base.weight.x * interpolation(u.x) * interpolation(u.y);
-                    let i = b * params.plane + at(j, params.in_size.x);
-                    sum += w * vec3f(in_r[i], in_g[i], in_b[i]);
+                    sum += w * pixel(b * params.plane + at(j, params.in_size.x));
                 }
             }
         }

@@ -29,10 +29,10 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
                 let d = displacement(base.abc, base.def, vec2f(first + vec2i(x, y)) - params.centre);
                 let u = shift - vec2f(f32(x), f32(y)) - d;
                 let w = counts * interpolation(u.y) * interpolation4(u.x + vec4f(0.0, 1.0, 2.0, 3.0));
-                let j = i + u32(x);
-                red += w * in_r[j];
-                green += w * in_g[j];
-                blue += w * in_b[j];
+                let value = pixel(i + u32(x));
+                red += w * value.x;
+                green += w * value.y;
+                blue += w * value.z;
             }
         }
     }

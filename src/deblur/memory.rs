@@ -3,7 +3,7 @@
 //! Bytes, with n pixels of the latent grid (the frame and its pad), m of the frame, F frames, S of them shaken, C channels solved together (3; 1
 //! when memory is short):
 //!
-//! `(52 + 20 C) n + 16 F m + (4 C + 24 S) m [when S > 0] + 4 C scratch + partial sums`
+//! `(52 + 20 C) n + 16 F m + (4 C + 24 S) m [when S > 0] + T scratch + partial sums`, where T is 16 for three channels and 4 for one.
 //!
 //! 52 n: irradiance, the step, weights and weighted observations of the sharp frames (three channels each), edge weights. 20 C n: the vectors
 //! of the conjugate gradients and the preconditioner. Vectors that are never alive together share buffers. 16 F m: exposures and masks, needed only when

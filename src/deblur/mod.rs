@@ -325,8 +325,8 @@ impl Layout {
         }
         let scratch = |size: fn(&Blur) -> ScratchSize| blurs().map(size).fold(ScratchSize::default(), ScratchSize::max);
         let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
-        // All bases at once while they are small (fewer dispatches), one 128 MiB binding at most.
-        let most = (1 << 25).min(gpu.max_binding());
+        // All bases at once while they are small (fewer dispatches), half a gigabyte at most.
+        let most = (1 << 25).min(gpu.max_texels());
         let shaken = blurs().count();
         let need = Need {
             latent: n,

@@ -3,7 +3,7 @@
 use super::Gpu;
 use std::sync::Arc;
 
-/// One compiled kernel: binding 0 is its uniform `Params`, storage buffers follow in order.
+/// One compiled kernel: binding 0 is its uniform `Params`, buffers and textures follow in order.
 pub struct Kernel {
     label: &'static str,
     pipeline: wgpu::ComputePipeline,
@@ -57,17 +57,17 @@ impl Kernel {
 
     /// A dispatch of `groups` workgroups with these parameters and buffers.
     pub fn step<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, buffers: &[&wgpu::Buffer], groups: [u32; 3]) -> Step {
-        let parts: Vec<_> = buffers.iter().map(|b| b.as_entire_buffer_binding()).collect();
+        let parts: Vec<_> = buffers.iter().map(|b| b.as_entire_binding()).collect();
         self.step_parts(gpu, params, &parts, groups)
     }
 
-    /// [`Kernel::step`] that sees only parts of its buffers.
-    pub fn step_parts<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, parts: &[wgpu::BufferBinding], groups: [u32; 3]) -> Step {
+    /// [`Kernel::step`] that sees parts of buffers, or textures.
+    pub fn step_parts<P: bytemuck::Pod>(&self, gpu: &Gpu, params: &P, parts: &[wgpu::BindingResource], groups: [u32; 3]) -> Step {
         let uniform = gpu.uniform(self.label, bytemuck::bytes_of(params));
-        let entries: Vec<_> = std::iter::once(uniform.as_entire_buffer_binding())
+        let entries: Vec<_> = std::iter::once(uniform.as_entire_binding())
             .chain(parts.iter().cloned())
             .enumerate()
-            .map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: wgpu::BindingResource::Buffer(b) })
+            .map(|(i, resource)| wgpu::BindGroupEntry { binding: i as u32, resource })
             .collect();
         let bindings =
             gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries });

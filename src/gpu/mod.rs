@@ -56,14 +56,26 @@ struct Turns {
     last: Mutex<Option<(wgpu::SubmissionIndex, Instant, usize)>>,
 }
 
+/// An array of pixels in a texture, wrapped at rows of [`TEXEL_ROW`]; see shaders/common/texels.wgsl.
+pub struct Texels(wgpu::TextureView);
+
+impl Texels {
+    /// The array as a kernel's input or output.
+    pub fn binding(&self) -> wgpu::BindingResource<'_> {
+        wgpu::BindingResource::TextureView(&self.0)
+    }
+}
+
 /// Some rows of an image in a buffer, as a dispatch sees them.
 pub struct Rows<'a> {
     /// The part of the buffer.
-    pub binding: wgpu::BufferBinding<'a>,
+    pub binding: wgpu::BindingResource<'a>,
     /// Row of the image that comes first in it.
     pub first: usize,
 }
 
+/// Pixels per row of a texture that holds an array; shaders/common/texels.wgsl shifts by its logarithm.
+const TEXEL_ROW: usize = 4096;
 /// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
 /// alignment that every adapter accepts.
 const ROW_STEP: usize = 64;
@@ -113,6 +125,7 @@ pub fn device_descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'sta
     let limits = wgpu::Limits {
         max_storage_buffer_binding_size: available.max_storage_buffer_binding_size,
         max_buffer_size: available.max_buffer_size,
+        max_texture_dimension_2d: available.max_texture_dimension_2d,
         ..wgpu::Limits::default()
     };
     wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() }
@@ -209,11 +222,8 @@ impl Gpu {
     pub fn rows<'a>(&self, buffer: &'a wgpu::Buffer, size: (usize, usize), rows: std::ops::Range<usize>) -> Rows<'a> {
         let (width, last) = size;
         if width * last <= self.max_binding() {
-            let binding = if buffer.size() <= self.binding_limit {
-                buffer.as_entire_buffer_binding()
-            } else {
-                Self::part(buffer, &(0..width * last))
-            };
+            let binding =
+                if buffer.size() <= self.binding_limit { buffer.as_entire_binding() } else { Self::part(buffer, &(0..width * last)) };
             return Rows { binding, first: 0 };
         }
         let first = rows.start.min(last.saturating_sub(1)) / ROW_STEP * ROW_STEP;
@@ -239,9 +249,9 @@ impl Gpu {
     }
 
     /// The values `values` of a buffer, of which the first is a multiple of 64.
-    pub fn part<'a>(buffer: &'a wgpu::Buffer, values: &std::ops::Range<usize>) -> wgpu::BufferBinding<'a> {
+    pub fn part<'a>(buffer: &'a wgpu::Buffer, values: &std::ops::Range<usize>) -> wgpu::BindingResource<'a> {
         let size = std::num::NonZero::new(((values.end - values.start) * 4) as u64);
-        wgpu::BufferBinding { buffer, offset: (values.start * 4) as u64, size }
+        wgpu::BindingResource::Buffer(wgpu::BufferBinding { buffer, offset: (values.start * 4) as u64, size })
     }
 
     /// A storage buffer of `count` zeros.
@@ -253,20 +263,58 @@ impl Gpu {
             return Err(Error::OutOfMemory(format!("{label}: {count} values are more than one buffer of this adapter holds")));
         }
         let size = (count.max(2) * 4) as u64;
+        self.allocate(label, size, || {
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some(label),
+                size,
+                usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
+        })
+    }
+
+    /// What `make` makes, of `size` bytes, if there is room for it.
+    fn allocate<T>(&self, label: &str, size: u64, make: impl FnOnce() -> T) -> Result<T> {
+        let full = || Error::OutOfMemory(format!("{label}: {size} bytes"));
         if self.counted.fetch_add(size, Ordering::Relaxed) + size > self.memory_limit {
-            return Err(Error::OutOfMemory(format!("{label}: {size} bytes")));
+            return Err(full());
         }
         let scope = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
-        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some(label),
-            size,
-            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        match pollster::block_on(scope.pop()) {
-            Some(_) => Err(Error::OutOfMemory(format!("{label}: {size} bytes"))),
-            None => Ok(buffer),
+        let made = make();
+        pollster::block_on(scope.pop()).map_or(Ok(made), |_| Err(full()))
+    }
+
+    /// Most pixels that [`Gpu::texels`] may hold.
+    pub fn max_texels(&self) -> usize {
+        TEXEL_ROW * self.device.limits().max_texture_dimension_2d as usize
+    }
+
+    /// Bytes of [`Gpu::texels`] of `count` pixels of `channels` channels, one or three: whole rows, and four values where there are three.
+    pub fn texel_bytes(count: usize, channels: usize) -> u64 {
+        (count.max(1).next_multiple_of(TEXEL_ROW) * if channels > 1 { 16 } else { 4 }) as u64
+    }
+
+    /// An array of `count` pixels of `channels` channels, one or three, that kernels write as a storage texture and read as a texture.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`] when there are more than [`Gpu::max_texels`], or there is no room.
+    pub fn texels(&self, label: &str, count: usize, channels: usize) -> Result<Texels> {
+        if count > self.max_texels() {
+            return Err(Error::OutOfMemory(format!("{label}: {count} pixels are more than one texture of this adapter holds")));
         }
+        let texture = self.allocate(label, Self::texel_bytes(count, channels), || {
+            self.device.create_texture(&wgpu::TextureDescriptor {
+                label: Some(label),
+                size: wgpu::Extent3d { width: TEXEL_ROW as u32, height: count.max(1).div_ceil(TEXEL_ROW) as u32, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: if channels > 1 { wgpu::TextureFormat::Rgba32Float } else { wgpu::TextureFormat::R32Float },
+                usage: wgpu::TextureUsages::STORAGE_BINDING | wgpu::TextureUsages::TEXTURE_BINDING,
+                view_formats: &[],
+            })
+        })?;
+        Ok(Texels(texture.create_view(&wgpu::TextureViewDescriptor::default())))
     }
 
     /// A storage buffer that holds `values`.

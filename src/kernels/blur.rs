@@ -9,31 +9,25 @@
 //! copied with a margin of zeros first.
 
 use crate::error::Result;
-use crate::gpu::{Gpu, Kernel, Step};
+use crate::gpu::{Gpu, Kernel, Step, Texels};
 use crate::tsf::{Interpolation, TapSet};
+use bytemuck::Zeroable;
 use glam::{DMat3, DVec2};
 use std::ops::Range;
 use std::sync::OnceLock;
 
-pub(super) const PADDED: &str = concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/padded.wgsl"));
-pub(super) const WARP: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/pose.wgsl"),
-    include_str!("../../shaders/warp.wgsl")
-);
-pub(super) const WARP_ADJOINT: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/pose.wgsl"),
-    include_str!("../../shaders/common/adjoint.wgsl"),
-    include_str!("../../shaders/warp_adjoint.wgsl")
-);
-pub(super) const WARP_ADJOINT_NEAR: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/pose.wgsl"),
-    include_str!("../../shaders/common/adjoint.wgsl"),
-    include_str!("../../shaders/warp_adjoint_near.wgsl")
-);
-pub(super) const TAP_SUM: &str = include_str!("../../shaders/tap_sum.wgsl");
+/// Whole source of a kernel: its common parts, then its own file.
+macro_rules! source {
+    ($($file:literal),+) => { concat!($(include_str!(concat!("../../shaders/", $file, ".wgsl"))),+) };
+}
+
+pub(super) const PADDED: &str = source!("common/plane", "common/texels", "padded");
+pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp");
+pub(super) const WARP_DIRECT: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp_direct");
+pub(super) const WARP_ADJOINT: &str = source!("common/plane", "common/texels", "common/pose", "common/adjoint", "warp_adjoint");
+pub(super) const WARP_ADJOINT_NEAR: &str = source!("common/plane", "common/texels", "common/pose", "common/adjoint", "warp_adjoint_near");
+pub(super) const TAP_SUM: &str = source!("common/texels", "common/taps", "tap_sum");
+pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/taps", "tap_adjoint");
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -102,14 +96,16 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
     vec![
         ("padded", size_of::<PaddedParams>()),
         ("warp", size_of::<WarpParams>()),
+        ("warp_direct", size_of::<WarpParams>()),
         ("warp_adjoint", size_of::<WarpAdjointParams>()),
         ("warp_adjoint_near", size_of::<WarpAdjointParams>()),
         ("tap_sum", size_of::<TapParams>()),
+        ("tap_adjoint", size_of::<TapParams>()),
     ]
 }
 
 pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
-    ["warp", "warp_adjoint", "warp_adjoint_near"].map(|s| (s, "Base", size_of::<BaseTable>())).to_vec()
+    ["warp", "warp_direct", "warp_adjoint", "warp_adjoint_near"].map(|s| (s, "Base", size_of::<BaseTable>())).to_vec()
 }
 
 /// The compiled kernels of K and Kᵀ.
@@ -121,11 +117,14 @@ pub struct BlurKernels {
 
 struct Compiled {
     padded: Kernel,
+    warp: Kernel,
     /// Overwriting, adding.
-    warp: [Kernel; 2],
+    warp_direct: [Kernel; 2],
     warp_adjoint: Kernel,
     warp_adjoint_near: Kernel,
+    /// Overwriting, adding.
     tap_sum: [Kernel; 2],
+    tap_adjoint: Kernel,
 }
 
 impl BlurKernels {
@@ -137,16 +136,22 @@ impl BlurKernels {
     /// The kernels for `channels` channels at a time.
     fn compiled(&self, gpu: &Gpu, channels: usize) -> &Compiled {
         self.compiled[usize::from(channels > 1)].get_or_init(|| {
-            let constants = [("SUPPORT", self.support as f64), ("CHANNELS", channels as f64)];
+            let (support, together) = (("SUPPORT", self.support as f64), ("CHANNELS", channels as f64));
+            // The format of a storage texture is part of its type, which no constant changes.
+            let format = if channels > 1 { "rgba32float" } else { "r32float" };
+            let kernel =
+                |label, source: &str, constants: &[(&str, f64)]| Kernel::new(gpu, label, &source.replace("rgba32float", format), constants);
             let adding = |label, source, constants: &[(&'static str, f64)]| {
-                [0.0, 1.0].map(|add| Kernel::new(gpu, label, source, &[constants, &[("ACCUMULATE", add)]].concat()))
+                [0.0, 1.0].map(|add| kernel(label, source, &[constants, &[("ACCUMULATE", add)]].concat()))
             };
             Compiled {
-                padded: Kernel::new(gpu, "padded", PADDED, &constants[1..]),
-                warp: adding("warp", WARP, &constants),
-                warp_adjoint: Kernel::new(gpu, "warp_adjoint", WARP_ADJOINT, &constants),
-                warp_adjoint_near: Kernel::new(gpu, "warp_adjoint_near", WARP_ADJOINT_NEAR, &constants),
-                tap_sum: adding("tap_sum", TAP_SUM, &constants[1..]),
+                padded: kernel("padded", PADDED, &[together]),
+                warp: kernel("warp", WARP, &[support]),
+                warp_direct: adding("warp_direct", WARP_DIRECT, &[support, together]),
+                warp_adjoint: kernel("warp_adjoint", WARP_ADJOINT, &[support, together]),
+                warp_adjoint_near: kernel("warp_adjoint_near", WARP_ADJOINT_NEAR, &[support, together]),
+                tap_sum: adding("tap_sum", TAP_SUM, &[together]),
+                tap_adjoint: kernel("tap_adjoint", TAP_ADJOINT, &[]),
             }
         })
     }
@@ -188,7 +193,7 @@ fn rows_of(h: &DMat3, x: (f64, f64), y: (f64, f64)) -> Option<(f64, f64)> {
     Some(rows)
 }
 
-/// Values per channel of the two parts of a [`Scratch`].
+/// Pixels of the two parts of a [`Scratch`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ScratchSize {
     /// Planes of the base warps.
@@ -210,7 +215,7 @@ impl ScratchSize {
 
     /// Bytes for `channels` channels.
     pub fn bytes(self, channels: usize) -> u64 {
-        4 * (channels * (self.planes.max(2) + self.copy.max(2)) + 3 * UNUSED) as u64
+        Gpu::texel_bytes(self.planes, channels) + Gpu::texel_bytes(self.copy, channels) + (3 * 4 * UNUSED) as u64
     }
 }
 
@@ -219,8 +224,9 @@ const UNUSED: usize = 2;
 
 /// Scratch planes for copies and base warps, shared by all operators of one solver.
 pub struct Scratch {
-    planes: Vec<wgpu::Buffer>,
-    copy: Vec<wgpu::Buffer>,
+    planes: Texels,
+    copy: Texels,
+    channels: usize,
     /// Bound for the channels that are not there: for inputs, for the second output, for the third.
     unused: [wgpu::Buffer; 3],
     size: ScratchSize,
@@ -232,27 +238,17 @@ impl Scratch {
     /// # Errors
     /// As [`Gpu::plane`].
     pub fn new(gpu: &Gpu, size: ScratchSize, channels: usize) -> Result<Self> {
-        let make = |label, count| (0..channels).map(|_| gpu.plane(label, count)).collect::<Result<Vec<_>>>();
         let unused = [gpu.plane("unused input", UNUSED)?, gpu.plane("unused output", UNUSED)?, gpu.plane("unused output", UNUSED)?];
-        Ok(Self { planes: make("base warps", size.planes)?, copy: make("copy with margin", size.copy)?, unused, size })
+        let (planes, copy) = (gpu.texels("base warps", size.planes, channels)?, gpu.texels("copy with margin", size.copy, channels)?);
+        Ok(Self { planes, copy, channels, unused, size })
     }
 
     /// Channels at a time: 1 or 3.
     pub fn channels(&self) -> usize {
-        self.copy.len()
+        self.channels
     }
 
-    /// `parts` of one or three channels as the kernels' bindings of inputs or outputs.
-    fn bound<'a>(&'a self, parts: &[wgpu::BufferBinding<'a>], output: bool) -> [wgpu::BufferBinding<'a>; 3] {
-        let unused = |c: usize| self.unused[if output { c } else { 0 }].as_entire_buffer_binding();
-        std::array::from_fn(|c| parts.get(c).cloned().unwrap_or_else(|| unused(c)))
-    }
-
-    fn whole<'a>(&'a self, buffers: &'a [wgpu::Buffer], output: bool) -> [wgpu::BufferBinding<'a>; 3] {
-        self.bound(&buffers.iter().map(|b| b.as_entire_buffer_binding()).collect::<Vec<_>>(), output)
-    }
-
-    /// The rows `rows` of images of `size` as bindings, and the row that comes first in them.
+    /// The rows `rows` of one or three images of `size` as the kernels' bindings of inputs or outputs, and the row that comes first in them.
     fn rows<'a>(
         &'a self,
         gpu: &Gpu,
@@ -260,10 +256,11 @@ impl Scratch {
         size: (usize, usize),
         rows: Range<usize>,
         output: bool,
-    ) -> ([wgpu::BufferBinding<'a>; 3], i32) {
-        let parts: Vec<_> = images.iter().map(|b| gpu.rows(b, size, rows.clone())).collect();
-        let first = parts[0].first as i32;
-        (self.bound(&parts.into_iter().map(|p| p.binding).collect::<Vec<_>>(), output), first)
+    ) -> ([wgpu::BindingResource<'a>; 3], i32) {
+        let unused = |c: usize| self.unused[if output { c } else { 0 }].as_entire_binding();
+        let part = |b: &'a wgpu::Buffer| gpu.rows(b, size, rows.clone());
+        let first = part(&images[0]).first as i32;
+        (std::array::from_fn(|c| images.get(c).map_or_else(|| unused(c), |b| part(b).binding)), first)
     }
 }
 
@@ -294,16 +291,20 @@ struct Cut {
     bases: usize,
 }
 
+/// Entries of the base table that are bound together: 40 KiB, and a multiple of every alignment.
+const BASES: usize = 512;
 /// `vec4i` of a tap table: what 64 KiB, the least that every adapter binds as a uniform, hold.
 const TABLE: usize = 4096;
 /// Taps of one group at most, so that even taps without neighbours (one entry each) fit a table.
 const GROUP_TAPS: usize = 3000;
+/// Pixels of a column that one invocation of shaders/common/taps.wgsl makes.
+const TALL: usize = 16;
 /// Zeros around the copy of the latent grid: at least the width of an interpolation.
 const MARGIN: usize = 8;
 /// Zero columns on either side of the adjoint's planes: at least the window of shaders/warp_adjoint_near.wgsl.
 const SIDE: usize = 12;
 
-/// Shifts (dy, dx, weight) of one base warp, sorted.
+/// Shifts (dx, dy, weight) of one base warp, sorted.
 type Group = Vec<(i32, i32, f64)>;
 
 /// Taps of consecutive base warps that share one table.
@@ -314,13 +315,18 @@ struct Chunk {
     adjoint: wgpu::Buffer,
 }
 
-/// Appends the runs of consecutive places in x of `taps` (y, x, weight), sorted, in the layout of shaders/tap_sum.wgsl.
+/// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/tap_sum.wgsl.
 fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
     for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
         let weight = |m: usize| run.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
-        table.push([run[0].0 * stride as i32 + run[0].1, run.len() as i32, weight(0), weight(1)]);
+        table.push([run[0].1 * stride as i32 + run[0].0, run.len() as i32, weight(0), weight(1)]);
         table.extend((2..run.len()).step_by(4).map(|m| std::array::from_fn(|c| weight(m + c))));
     }
+}
+
+/// Workgroups that each make `tile` pixels, for `depth` images of `size`.
+fn grid(size: [i32; 2], tile: (usize, usize), depth: usize) -> [u32; 3] {
+    [(size[0] as usize).div_ceil(tile.0) as u32, (size[1] as usize).div_ceil(tile.1) as u32, depth as u32]
 }
 
 impl Blur {
@@ -350,14 +356,14 @@ impl Blur {
             near,
             reach,
             direct,
-            base_table: gpu.table::<BaseTable>("base warps", &[]),
+            base_table: gpu.uniform("base warps", bytemuck::bytes_of(&BaseTable::zeroed())),
             chunks: Vec::new(),
         };
         // A base warp with more taps than a table holds stands there several times; one without any, not at all.
         let (mut table, mut groups) = (Vec::new(), Vec::new());
         for (b, h) in taps.bases.iter().enumerate() {
             let ((abc, def), (abc_inverse, def_inverse)) = (displacement_table(&h.inverse()), displacement_table(h));
-            let mut own: Group = taps.taps.iter().filter(|t| t.base == b).map(|t| (t.dy, t.dx, t.weight)).collect();
+            let mut own: Group = taps.taps.iter().filter(|t| t.base == b).map(|t| (t.dx, t.dy, t.weight)).collect();
             own.sort_by_key(|t| (t.0, t.1));
             for part in own.chunks(GROUP_TAPS) {
                 let weight = if direct { part[0].2 as f32 } else { 1.0 };
@@ -366,7 +372,8 @@ impl Blur {
                 groups.push(part.to_vec());
             }
         }
-        blur.base_table = gpu.table("base warps", &table);
+        table.resize(table.len().next_multiple_of(BASES), BaseTable::zeroed());
+        blur.base_table = gpu.uniform("base warps", bytemuck::cast_slice(&table));
         if !direct {
             blur.chunks = blur.tables(gpu, &groups);
         }
@@ -380,10 +387,10 @@ impl Blur {
             table[g / 4][g % 4] = table.len() as i32;
             // K reads its planes at p - shift, Kᵀ the frame at q + shift; both from the corner that the farthest shift reaches.
             if adjoint {
-                let places: Group = taps.iter().map(|t| (t.0 - self.shift_y.0, t.1 - self.shift_x.0, t.2)).collect();
+                let places: Group = taps.iter().map(|t| (t.0 - self.shift_x.0, t.1 - self.shift_y.0, t.2)).collect();
                 append_runs(&places, self.copy_width(), &mut table);
             } else {
-                let places: Group = taps.iter().rev().map(|t| (self.shift_y.1 - t.0, self.shift_x.1 - t.1, t.2)).collect();
+                let places: Group = taps.iter().rev().map(|t| (self.shift_x.1 - t.0, self.shift_y.1 - t.1, t.2)).collect();
                 append_runs(&places, self.width(false), &mut table);
             }
         }
@@ -416,14 +423,14 @@ impl Blur {
         ((self.shift_x.1 - self.shift_x.0) as usize, (self.shift_y.1 - self.shift_y.0) as usize)
     }
 
-    /// Values per row of a plane of base warps. Eight pixels of a row are made at once: the last eight may begin at the last pixel.
+    /// Pixels per row of a plane of base warps.
     fn width(&self, adjoint: bool) -> usize {
-        (self.frame.0 + self.shifts().0 + if adjoint { 2 * SIDE } else { 7 }).next_multiple_of(8)
+        self.frame.0 + self.shifts().0 + if adjoint { 2 * SIDE } else { 0 }
     }
 
-    /// Values per row of the copy that the adjoint reads.
+    /// Pixels per row of the copy that the adjoint reads.
     fn copy_width(&self) -> usize {
-        if self.direct { self.frame.0 + 2 * SIDE } else { self.width(true) + self.shifts().0 + 8 }
+        if self.direct { self.frame.0 + 2 * SIDE } else { self.width(true) + self.shifts().0 }
     }
 
     /// Rows of scratch in all: what the shifts make of the frame.
@@ -454,7 +461,7 @@ impl Blur {
         low..high
     }
 
-    /// Values per channel of the copy that K reads for `rows` rows of the frame, at most.
+    /// Pixels of the copy that K reads for `rows` rows of the frame, at most.
     fn forward_copy(&self, rows: usize) -> usize {
         let bands = (0..self.frame.1).step_by(rows).map(|y| self.forward_band(y, (y + rows).min(self.frame.1)).len());
         bands.max().unwrap_or(0) * (self.latent.0 + 2 * MARGIN)
@@ -503,8 +510,8 @@ impl Blur {
         let mut cut = Cut { rows, bases: ((budget / rows as f64) as usize).clamp(1, all) };
         let fits = |cut: Cut| {
             let need = self.scratch_for(cut);
-            need.planes <= scratch.size.planes.min(gpu.max_binding())
-                && need.copy <= scratch.size.copy.min(gpu.max_binding())
+            need.planes <= scratch.size.planes
+                && need.copy <= scratch.size.copy
                 && gpu.rows_fit(self.forward_copy(cut.rows) / (self.latent.0 + 2 * MARGIN), self.latent)
                 && gpu.rows_fit(self.adjoint_rows(cut.rows), self.latent)
                 && gpu.rows_fit(cut.rows + self.shifts().1, self.frame)
@@ -532,11 +539,29 @@ impl Blur {
 
     /// (tap table, first base, number of bases) of the passes that do `at_once` bases each.
     fn passes(&self, at_once: usize) -> Vec<(Option<&Chunk>, usize, usize)> {
-        let parts = |first: usize, end: usize| (first..end).step_by(at_once).map(move |b| (b, at_once.min(end - b)));
+        let mut passes = Vec::new();
+        let mut cut = |chunk, first: usize, end: usize| {
+            let mut b = first;
+            while b < end {
+                let n = at_once.min(end - b).min(BASES - b % BASES);
+                passes.push((chunk, b, n));
+                b += n;
+            }
+        };
         if self.direct {
-            return parts(0, self.homographies.len()).map(|(b, n)| (None, b, n)).collect();
+            cut(None, 0, self.homographies.len());
         }
-        self.chunks.iter().flat_map(|c| parts(c.first, c.first + c.count).map(move |(b, n)| (Some(c), b, n))).collect()
+        for c in &self.chunks {
+            cut(Some(c), c.first, c.first + c.count);
+        }
+        passes
+    }
+
+    /// The entries of the base table that hold entry `first`, which is entry `first % BASES` of them.
+    fn bases(&self, first: usize) -> wgpu::BindingResource<'_> {
+        let bytes = (BASES * size_of::<BaseTable>()) as u64;
+        let offset = (first / BASES) as u64 * bytes;
+        wgpu::BindingResource::Buffer(wgpu::BufferBinding { buffer: &self.base_table, offset, size: std::num::NonZero::new(bytes) })
     }
 
     /// Copies the rows `rows` of `from` (an image of `size`) and the columns from `first` on, `width` of them, into the scratch.
@@ -560,8 +585,8 @@ impl Blur {
             in_first,
             _pad: 0,
         };
-        let [x, y, z] = scratch.whole(&scratch.copy, true);
-        kernels.padded.step_parts(gpu, &params, &[r, g, b, x, y, z], [width.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1])
+        let parts = [r, g, b, scratch.copy.binding()];
+        kernels.padded.step_parts(gpu, &params, &parts, [width.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1])
     }
 
     /// Steps of `frame = K latent`, of one channel or three: as many as `scratch` is for.
@@ -583,8 +608,9 @@ impl Blur {
             steps.push(self.copy(gpu, kernels, scratch, latent, self.latent, -(MARGIN as i32), copy_width, &rows));
             let (target, first_row) = scratch.rows(gpu, frame, self.frame, from..to, true);
             let out_first = from as i32 - first_row;
-            let copy = scratch.whole(&scratch.copy, false);
             for (chunk, first, n) in self.passes(cut.bases) {
+                let [x, y, z] = target.clone();
+                let (table, copy, planes) = (self.bases(first), scratch.copy.binding(), scratch.planes.binding());
                 let (width, height) = (self.width(false), to - from + self.shifts().1);
                 let mut params = WarpParams {
                     in_size: [copy_width as i32, rows.len() as i32],
@@ -593,26 +619,20 @@ impl Blur {
                     out_origin: [-self.shift_x.1, from as i32 - self.shift_y.1],
                     centre: [(self.frame.0 as f32 - 1.0) / 2.0, (self.frame.1 as f32 - 1.0) / 2.0],
                     out_first: 0,
-                    first_base: first as u32,
+                    first_base: (first % BASES) as u32,
                     span: 1,
                     _pad: [0; 3],
-                };
-                let mut warp = |params: &WarpParams, out: [wgpu::BufferBinding; 3], depth: usize, add: bool| {
-                    let table = self.base_table.as_entire_buffer_binding();
-                    let [a, b, c] = copy.clone();
-                    let [x, y, z] = out;
-                    let groups = [(params.out_size[0] as u32).div_ceil(64), (params.out_size[1] as u32).div_ceil(8), depth as u32];
-                    steps.push(kernels.warp[usize::from(add)].step_parts(gpu, params, &[table, a, b, c, x, y, z], groups));
                 };
                 let Some(chunk) = chunk else {
                     params.out_size = [self.frame.0 as i32, (to - from) as i32];
                     params.out_origin = [0, from as i32];
                     params.out_first = out_first;
                     params.span = n as u32;
-                    warp(&params, target.clone(), 1, first > 0);
+                    let kernel = &kernels.warp_direct[usize::from(first > 0)];
+                    steps.push(kernel.step_parts(gpu, &params, &[table, copy, x, y, z], grid(params.out_size, (16, 8), 1)));
                     continue;
                 };
-                warp(&params, scratch.whole(&scratch.planes, true), n, false);
+                steps.push(kernels.warp.step_parts(gpu, &params, &[table, copy, planes.clone()], grid(params.out_size, (16, 8), n)));
                 let params = TapParams {
                     out_size: [self.frame.0 as i32, (to - from) as i32],
                     in_stride: width as i32,
@@ -622,10 +642,9 @@ impl Blur {
                     out_first,
                     _pad: 0,
                 };
-                let ([a, b, c], [x, y, z]) = (scratch.whole(&scratch.planes, false), target.clone());
-                let parts = [chunk.forward.as_entire_buffer_binding(), a, b, c, x, y, z];
-                let groups = [self.frame.0.div_ceil(128) as u32, (to - from).div_ceil(8) as u32, 1];
-                steps.push(kernels.tap_sum[usize::from(first > 0)].step_parts(gpu, &params, &parts, groups));
+                let parts = [chunk.forward.as_entire_binding(), planes, x, y, z];
+                let kernel = &kernels.tap_sum[usize::from(first > 0)];
+                steps.push(kernel.step_parts(gpu, &params, &parts, grid(params.out_size, (32, 4 * TALL), 1)));
             }
         }
         steps
@@ -656,8 +675,6 @@ impl Blur {
             let read = top + from as i32 + self.shift_y.0..top + to as i32 + self.shift_y.1;
             steps.push(self.copy(gpu, kernels, scratch, frame, self.frame, left + self.shift_x.0, copy_width, &read));
             let (target, out_first) = scratch.rows(gpu, latent, self.latent, rows.start as usize..rows.end as usize, true);
-            let copy = || scratch.whole(&scratch.copy, false);
-            let planes = |output: bool| scratch.whole(&scratch.planes, output);
             for (chunk, first, n) in self.passes(cut.bases) {
                 let (width, height) = (self.width(true), to - from);
                 let mut params = WarpAdjointParams {
@@ -669,7 +686,7 @@ impl Blur {
                     rows: [rows.start, rows.end],
                     out_first,
                     plane: (width * height) as u32,
-                    first_base: first as u32,
+                    first_base: (first % BASES) as u32,
                     bases: n as u32,
                     reach: self.reach,
                     factor,
@@ -684,21 +701,18 @@ impl Blur {
                         out_first: 0,
                         _pad: 0,
                     };
-                    let ([a, b, c], [x, y, z]) = (copy(), planes(true));
-                    let parts = [chunk.adjoint.as_entire_buffer_binding(), a, b, c, x, y, z];
-                    let groups = [width.div_ceil(128) as u32, height.div_ceil(8) as u32, n as u32];
-                    steps.push(kernels.tap_sum[0].step_parts(gpu, &params, &parts, groups));
-                    planes(false)
+                    let parts = [chunk.adjoint.as_entire_binding(), scratch.copy.binding(), scratch.planes.binding()];
+                    steps.push(kernels.tap_adjoint.step_parts(gpu, &params, &parts, grid(params.out_size, (32, 4 * TALL), n)));
+                    scratch.planes.binding()
                 } else {
                     params.in_size[0] = copy_width as i32;
                     params.plane = 0;
-                    copy()
+                    scratch.copy.binding()
                 };
                 let (kernel, wide) = if self.near { (&kernels.warp_adjoint_near, 64) } else { (&kernels.warp_adjoint, 16) };
-                let ([a, b, c], [x, y, z]) = (source, target.clone());
-                let parts = [self.base_table.as_entire_buffer_binding(), a, b, c, x, y, z];
-                let groups = [self.latent.0.div_ceil(wide) as u32, rows.len().div_ceil(8) as u32, 1];
-                steps.push(kernel.step_parts(gpu, &params, &parts, groups));
+                let [x, y, z] = target.clone();
+                let parts = [self.bases(first), source, x, y, z];
+                steps.push(kernel.step_parts(gpu, &params, &parts, grid([params.size[0], rows.len() as i32], (wide, 8), 1)));
             }
         }
         steps

@@ -191,9 +191,9 @@ impl Part {
         vectors: &[&wgpu::Buffer],
         after: &[&wgpu::Buffer],
     ) -> Step {
-        let mut bound: Vec<wgpu::BufferBinding> = before.iter().map(|b| b.as_entire_buffer_binding()).collect();
+        let mut bound: Vec<wgpu::BindingResource> = before.iter().map(|b| b.as_entire_binding()).collect();
         bound.extend(vectors.iter().map(|b| Gpu::part(b, &self.values)));
-        bound.extend(after.iter().map(|b| b.as_entire_buffer_binding()));
+        bound.extend(after.iter().map(|b| b.as_entire_binding()));
         kernel.step_parts(gpu, params, &bound, [self.row, self.rows, 1])
     }
 }
@@ -222,7 +222,7 @@ impl Band {
     }
 
     /// Bindings of the band and its neighbours in `planes`, and the row that comes first in them.
-    fn bind<'a>(&self, gpu: &Gpu, planes: &[&'a wgpu::Buffer], size: (usize, usize)) -> (Vec<wgpu::BufferBinding<'a>>, i32) {
+    fn bind<'a>(&self, gpu: &Gpu, planes: &[&'a wgpu::Buffer], size: (usize, usize)) -> (Vec<wgpu::BindingResource<'a>>, i32) {
         let seen = self.rows.start.saturating_sub(HALO)..(self.rows.end + HALO).min(size.1);
         let bound: Vec<_> = planes.iter().map(|b| gpu.rows(b, size, seen.clone())).collect();
         let first = bound[0].first as i32;
@@ -280,7 +280,7 @@ impl LinearKernels {
         let [r, g, b] = irradiance;
         let step = |band: Band| {
             let (mut bound, first) = band.bind(gpu, &[r, g, b, edge], size);
-            bound.push(partials.as_entire_buffer_binding());
+            bound.push(partials.as_entire_binding());
             let params = EdgeParams {
                 size: [size.0 as i32, size.1 as i32],
                 rows: band.rows(),
@@ -311,7 +311,7 @@ impl LinearKernels {
     ) -> Vec<Step> {
         let step = |band: Band| {
             let (mut bound, first) = band.bind(gpu, &[irradiance, back, edge, direction, product], size);
-            bound.push(partials.as_entire_buffer_binding());
+            bound.push(partials.as_entire_binding());
             let params = NormalParams {
                 size: [size.0 as i32, size.1 as i32],
                 rows: band.rows(),

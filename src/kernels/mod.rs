@@ -55,9 +55,11 @@ impl Kernels {
 pub const SHADERS: &[(&str, &str)] = &[
     ("padded", blur::PADDED),
     ("warp", blur::WARP),
+    ("warp_direct", blur::WARP_DIRECT),
     ("warp_adjoint", blur::WARP_ADJOINT),
     ("warp_adjoint_near", blur::WARP_ADJOINT_NEAR),
     ("tap_sum", blur::TAP_SUM),
+    ("tap_adjoint", blur::TAP_ADJOINT),
     ("weights", data::WEIGHTS),
     ("misfit", data::MISFIT),
     ("gauss", data::GAUSS),
