@@ -14,10 +14,13 @@ struct Params {
 
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let i = (group.y * params.row + group.x) * 128u + local;
+    let g = group.y * params.row + group.x;
     let before = scalars[params.scalars + 2u];
     let beta = select(0.0, scalars[params.scalars] / before, before > 0.0);
-    if i < params.count {
-        direction[i] = residual[i] / diagonal[i] + beta * direction[i];
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            direction[i] = residual[i] / diagonal[i] + beta * direction[i];
+        }
     }
 }

@@ -19,13 +19,15 @@ var<workgroup> shared_sum: array<f32, 128>;
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
     let g = group.y * params.row + group.x;
-    let i = g * 128u + local;
     var term = 0.0;
-    if i < params.count {
-        let z = residual[i] / diagonal[i];
-        solution[i] = 0.0;
-        direction[i] = z;
-        term = residual[i] * z;
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            let z = residual[i] / diagonal[i];
+            solution[i] = 0.0;
+            direction[i] = z;
+            term += residual[i] * z;
+        }
     }
     shared_sum[local] = term;
     for (var s = 64u; s > 0u; s >>= 1u) {

@@ -21,17 +21,19 @@ var<workgroup> shared_sum: array<f32, 128>;
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
     let g = group.y * params.row + group.x;
-    let i = g * 128u + local;
     // A search direction without curvature has nothing left to find: alpha 0 ends the iteration in place.
     let energy = scalars[params.scalars];
     let curvature = scalars[params.scalars + 1u];
     let alpha = select(0.0, energy / curvature, curvature > 0.0);
     var term = 0.0;
-    if i < params.count {
-        solution[i] += alpha * direction[i];
-        let r = residual[i] - alpha * product[i];
-        residual[i] = r;
-        term = r * r / diagonal[i];
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            solution[i] += alpha * direction[i];
+            let r = residual[i] - alpha * product[i];
+            residual[i] = r;
+            term += r * r / diagonal[i];
+        }
     }
     shared_sum[local] = term;
     for (var s = 64u; s > 0u; s >>= 1u) {

@@ -27,21 +27,24 @@ fn squared_difference(i: u32, k: u32) -> f32 {
 }
 
 @compute @workgroup_size(16, 8)
-fn main(@builtin(global_invocation_id) id: vec3u, @builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let p = vec2i(id.xy) + vec2i(0, params.rows.x);
+fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
+    let corner = vec2i(vec2u(group.x * 16u + local % 16u, group.y * EACH * 8u + local / 16u)) + vec2i(0, params.rows.x);
     var term = 0.0;
-    if p.x < params.size.x && p.y < params.rows.y {
-        let i = at(p - vec2i(0, params.first), params.size.x);
-        var squared = params.epsilon * params.epsilon;
-        if p.x + 1 < params.size.x {
-            squared += squared_difference(i, i + 1u);
+    for (var j = 0u; j < EACH; j += 1u) {
+        let p = corner + vec2i(0, i32(j) * 8);
+        if p.x < params.size.x && p.y < params.rows.y {
+            let i = at(p - vec2i(0, params.first), params.size.x);
+            var squared = params.epsilon * params.epsilon;
+            if p.x + 1 < params.size.x {
+                squared += squared_difference(i, i + 1u);
+            }
+            if p.y + 1 < params.size.y {
+                squared += squared_difference(i, i + u32(params.size.x));
+            }
+            let length = sqrt(squared);
+            edge[i] = params.lambda / length;
+            term += params.lambda * (length - params.epsilon);
         }
-        if p.y + 1 < params.size.y {
-            squared += squared_difference(i, i + u32(params.size.x));
-        }
-        let length = sqrt(squared);
-        edge[i] = params.lambda / length;
-        term = params.lambda * (length - params.epsilon);
     }
     shared_sum[local] = term;
     for (var s = 64u; s > 0u; s >>= 1u) {

@@ -11,8 +11,11 @@ struct Params {
 
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let i = (group.y * params.row + group.x) * 128u + local;
-    if i < params.count {
-        values[i] *= factors[i];
+    let g = group.y * params.row + group.x;
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            values[i] *= factors[i];
+        }
     }
 }

@@ -24,14 +24,17 @@ fn value(i: u32) -> f32 {
 }
 
 @compute @workgroup_size(16, 8)
-fn main(@builtin(global_invocation_id) id: vec3u, @builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let p = vec2i(id.xy) + vec2i(0, params.rows.x);
+fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
+    let corner = vec2i(vec2u(group.x * 16u + local % 16u, group.y * EACH * 8u + local / 16u)) + vec2i(0, params.rows.x);
     var term = 0.0;
-    if p.x < params.size.x && p.y < params.rows.y {
-        let i = at(p - vec2i(0, params.first), params.size.x);
-        let q = irradiance[i] * back[i] + smoothness(p, i, params.size);
-        product[i] = q;
-        term = direction[i] * q;
+    for (var j = 0u; j < EACH; j += 1u) {
+        let p = corner + vec2i(0, i32(j) * 8);
+        if p.x < params.size.x && p.y < params.rows.y {
+            let i = at(p - vec2i(0, params.first), params.size.x);
+            let q = irradiance[i] * back[i] + smoothness(p, i, params.size);
+            product[i] = q;
+            term += direction[i] * q;
+        }
     }
     shared_sum[local] = term;
     for (var s = 64u; s > 0u; s >>= 1u) {

@@ -15,10 +15,13 @@ struct Params {
 
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let i = (group.y * params.row + group.x) * 128u + local;
-    if i < params.count {
-        let t = irradiance[i] * direction[i];
-        scaled[i] = t;
-        back[i] = weight[i] * t;
+    let g = group.y * params.row + group.x;
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            let t = irradiance[i] * direction[i];
+            scaled[i] = t;
+            back[i] = weight[i] * t;
+        }
     }
 }

@@ -16,9 +16,12 @@ struct Params {
 
 @compute @workgroup_size(128)
 fn main(@builtin(local_invocation_index) local: u32, @builtin(workgroup_id) group: vec3u) {
-    let i = (group.y * params.row + group.x) * 128u + local;
-    if i < params.count {
-        let x = params.step * solution[i];
-        irradiance[i] = max(old[i] * select(exp(max(x, -1.0)), 1.0 + clamp(x, 0.0, 3.0), x > 0.0), params.darkest);
+    let g = group.y * params.row + group.x;
+    for (var j = 0u; j < EACH; j += 1u) {
+        let i = (g * EACH + j) * 128u + local;
+        if i < params.count {
+            let x = params.step * solution[i];
+            irradiance[i] = max(old[i] * select(exp(max(x, -1.0)), 1.0 + clamp(x, 0.0, 3.0), x > 0.0), params.darkest);
+        }
     }
 }

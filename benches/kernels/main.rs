@@ -161,7 +161,7 @@ fn main() {
     let (observation, start) = observation(&taps, &image);
     let kernels = Kernels::new(&device.gpu);
     let solve = |inner: usize| {
-        let settings = Settings { outer: 1, inner, ..Settings::default() };
+        let settings = Settings { outer: 1, inner, interpolation: Interpolation::Bilinear, ..Settings::default() };
         time(|| drop(deblur::solve(&device.gpu, &kernels, std::slice::from_ref(&observation), &start, 0, &settings, &mut |_| true)))
     };
     let mut differences: Vec<f64> = (0..rounds.div_ceil(4)).map(|_| (solve(7) - solve(2)) / 5.0).collect();

@@ -3,9 +3,10 @@
 fn smoothness(p: vec2i, i: u32, size: vec2i) -> f32 {
     let row = u32(size.x);
     let here = value(i);
+    let weight = edge[i];
     var sum = 0.0;
-    if p.x + 1 < size.x { sum += edge[i] * (here - value(i + 1u)); }
-    if p.y + 1 < size.y { sum += edge[i] * (here - value(i + row)); }
+    if p.x + 1 < size.x { sum += weight * (here - value(i + 1u)); }
+    if p.y + 1 < size.y { sum += weight * (here - value(i + row)); }
     if p.x > 0 { sum += edge[i - 1u] * (here - value(i - 1u)); }
     if p.y > 0 { sum += edge[i - row] * (here - value(i - row)); }
     return sum;

@@ -33,7 +33,7 @@ pub enum Step {
 /// Workgroups for `count` invocations of kernels with 128 lanes, as (per row, rows): one dimension holds 65 535 at most.
 pub fn grid_1d(count: usize) -> (u32, u32) {
     let groups = count.div_ceil(128).max(1) as u32;
-    let row = groups.min(32768);
+    let row = groups.min(4096);
     (row, groups.div_ceil(row))
 }
 

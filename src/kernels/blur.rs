@@ -16,11 +16,6 @@ use glam::{DMat3, DVec2};
 use std::ops::Range;
 use std::sync::OnceLock;
 
-/// Whole source of a kernel: its common parts, then its own file.
-macro_rules! source {
-    ($($file:literal),+) => { concat!($(include_str!(concat!("../../shaders/", $file, ".wgsl"))),+) };
-}
-
 pub(super) const PADDED: &str = source!("common/plane", "common/texels", "padded");
 pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp");
 pub(super) const WARP_DIRECT: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp_direct");

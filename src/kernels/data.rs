@@ -4,18 +4,10 @@ use super::linear::{Part, grid_2d, parts};
 use crate::gpu::{Gpu, Kernel, Rows, Step};
 use std::ops::Range;
 
-pub(super) const WEIGHTS: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/noise.wgsl"),
-    include_str!("../../shaders/weights.wgsl")
-);
-pub(super) const MISFIT: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/noise.wgsl"),
-    include_str!("../../shaders/misfit.wgsl")
-);
-pub(super) const GAUSS: &str = concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/gauss.wgsl"));
-pub(super) const RESIDUAL: &str = include_str!("../../shaders/residual.wgsl");
+pub(super) const WEIGHTS: &str = source!("common/plane", "common/noise", "weights");
+pub(super) const MISFIT: &str = source!("common/plane", "common/noise", "misfit");
+pub(super) const GAUSS: &str = source!("common/plane", "gauss");
+pub(super) const RESIDUAL: &str = source!("common/vector", "residual");
 
 /// Samples of a noise curve: standard deviation of the exposure at equal steps of √exposure from 0 to 1.
 pub const NOISE_STEPS: usize = 256;

@@ -5,9 +5,9 @@ use std::collections::HashMap;
 use std::ops::Range;
 use wgpu::util::DeviceExt;
 
-pub(super) const PICTURE: &str = concat!(include_str!("../../shaders/common/corners.wgsl"), include_str!("../../shaders/picture.wgsl"));
-pub(super) const SHRINK: &str = concat!(include_str!("../../shaders/common/corners.wgsl"), include_str!("../../shaders/shrink.wgsl"));
-pub(super) const DISPLAY: &str = concat!(include_str!("../../shaders/common/corners.wgsl"), include_str!("../../shaders/display.wgsl"));
+pub(super) const PICTURE: &str = source!("common/corners", "picture");
+pub(super) const SHRINK: &str = source!("common/corners", "shrink");
+pub(super) const DISPLAY: &str = source!("common/corners", "display");
 
 /// What pictures are sampled from.
 const PICTURES: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;

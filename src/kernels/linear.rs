@@ -3,25 +3,16 @@
 use crate::gpu::{Gpu, Kernel, Step, grid_1d};
 use std::ops::Range;
 
-pub(super) const EDGE_WEIGHT: &str =
-    concat!(include_str!("../../shaders/common/plane.wgsl"), include_str!("../../shaders/edge_weight.wgsl"));
-pub(super) const NORMAL: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/smoothness.wgsl"),
-    include_str!("../../shaders/normal.wgsl")
-);
-pub(super) const RIGHT_SIDE: &str = concat!(
-    include_str!("../../shaders/common/plane.wgsl"),
-    include_str!("../../shaders/common/smoothness.wgsl"),
-    include_str!("../../shaders/right_side.wgsl")
-);
-pub(super) const SCALE: &str = include_str!("../../shaders/scale.wgsl");
-pub(super) const MULTIPLY: &str = include_str!("../../shaders/multiply.wgsl");
-pub(super) const CG_START: &str = include_str!("../../shaders/cg_start.wgsl");
-pub(super) const CG_STEP: &str = include_str!("../../shaders/cg_step.wgsl");
-pub(super) const CG_DIRECTION: &str = include_str!("../../shaders/cg_direction.wgsl");
-pub(super) const CG_SCALARS: &str = include_str!("../../shaders/cg_scalars.wgsl");
-pub(super) const UPDATE: &str = include_str!("../../shaders/update.wgsl");
+pub(super) const EDGE_WEIGHT: &str = source!("common/plane", "common/vector", "edge_weight");
+pub(super) const NORMAL: &str = source!("common/plane", "common/vector", "common/smoothness", "normal");
+pub(super) const RIGHT_SIDE: &str = source!("common/plane", "common/smoothness", "right_side");
+pub(super) const SCALE: &str = source!("common/vector", "scale");
+pub(super) const MULTIPLY: &str = source!("common/vector", "multiply");
+pub(super) const CG_START: &str = source!("common/vector", "cg_start");
+pub(super) const CG_STEP: &str = source!("common/vector", "cg_step");
+pub(super) const CG_DIRECTION: &str = source!("common/vector", "cg_direction");
+pub(super) const CG_SCALARS: &str = source!("cg_scalars");
+pub(super) const UPDATE: &str = source!("common/vector", "update");
 
 /// Scalar of a channel: ⟨r, z⟩.
 pub const SLOT_ENERGY: usize = 0;
@@ -138,8 +129,10 @@ pub(super) fn grid_2d(size: (usize, usize), rows: &Range<usize>) -> [u32; 3] {
     [size.0.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1]
 }
 
+/// Values that one invocation makes, in kernels on vectors and in those that sum over an image: shaders/common/vector.wgsl.
+const EACH: usize = 8;
 /// Values that a workgroup makes.
-const GROUP: usize = 128;
+const GROUP: usize = 128 * EACH;
 
 /// A part of one vector for each of the kernel's bindings.
 pub(super) struct Part {
@@ -156,7 +149,7 @@ pub(super) struct Part {
 pub(super) fn parts(gpu: &Gpu, count: usize, partial: usize) -> Vec<Part> {
     let mut next = partial;
     let part = |values: Range<usize>| {
-        let (row, rows) = grid_1d(values.len());
+        let (row, rows) = grid_1d(values.len().div_ceil(EACH));
         let part = Part { values, partial: next as u32, row, rows };
         next += part.partials();
         part
@@ -202,6 +195,7 @@ impl Part {
 struct Band {
     rows: Range<usize>,
     partial: u32,
+    /// Workgroups of the kernels that sum.
     groups: [u32; 3],
 }
 
@@ -209,7 +203,8 @@ struct Band {
 fn bands(gpu: &Gpu, size: (usize, usize), partial: usize) -> Vec<Band> {
     let mut next = partial;
     let band = |rows: Range<usize>| {
-        let band = Band { groups: grid_2d(size, &rows), partial: next as u32, rows };
+        let groups = [size.0.div_ceil(16) as u32, rows.len().div_ceil(8 * EACH) as u32, 1];
+        let band = Band { groups, partial: next as u32, rows };
         next += band.partials();
         band
     };
@@ -340,7 +335,7 @@ impl LinearKernels {
         let step = |band: Band| {
             let (bound, first) = band.bind(gpu, &[irradiance, back, edge, data_diagonal, right_side, diagonal], size);
             let params = RightSideParams { size: [size.0 as i32, size.1 as i32], rows: band.rows(), first, _pad: 0 };
-            self.right_side.step_parts(gpu, &params, &bound, band.groups)
+            self.right_side.step_parts(gpu, &params, &bound, grid_2d(size, &band.rows))
         };
         bands(gpu, size, 0).into_iter().map(step).collect()
     }

@@ -1,5 +1,10 @@
 //! The solver's operators on the GPU, one file per group of shaders. Knows no algorithm.
 
+/// Whole source of a kernel: its common parts, then its own file.
+macro_rules! source {
+    ($($file:literal),+) => { concat!($(include_str!(concat!("../../shaders/", $file, ".wgsl"))),+) };
+}
+
 mod blur;
 mod data;
 mod display;
