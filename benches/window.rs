@@ -1,5 +1,6 @@
-//! `cargo bench --features preview-tests --bench window`: milliseconds per redraw of the window with a picture of 1152 x 864 pixels, as
-//! median (fastest): from the event to the finished picture, the interface's own work included.
+//! `cargo bench --features preview-tests --bench window [-- FRAME...]`: seconds until a bracket's merge and its first solution are in the window,
+//! and milliseconds per redraw, as median (fastest): from the event to the finished picture, the interface's own work included. Without
+//! frames, three of 1152 x 864 pixels.
 
 #[path = "../tests/preview/support.rs"]
 #[expect(dead_code, reason = "the tests of the window need more of it")]
@@ -7,6 +8,7 @@ mod support;
 
 use egui::{Key, Pos2, Vec2};
 use egui_kittest::kittest::Queryable;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use support::{Times, Window, sized_frames};
@@ -45,13 +47,18 @@ fn dragged(window: &mut Window, from: Pos2) -> String {
 
 fn main() {
     let folder = tempfile::tempdir().expect("a folder");
-    let files = sized_frames(folder.path(), Times::Exif, (1152, 864));
+    let named: Vec<PathBuf> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).map(PathBuf::from).collect();
+    let files = if named.is_empty() { sized_frames(folder.path(), Times::Exif, (1152, 864)) } else { named };
+    let start = Instant::now();
     let options = Options { files, ..Options::default() };
     let mut window = Window::drawn(&options, Arc::default(), 1.0, egui_wgpu::RendererOptions::default());
     window.harness.run_steps(2);
     let view = window.harness.get_by_label("Main view").rect();
     window.harness.hover_at(view.center());
     window.wait("the plain merge", 240, |app| app.probed().is_some());
+    println!("the merge after {:.1} s", start.elapsed().as_secs_f64());
+    window.wait("the first solution", 240, |app| app.solution().is_some());
+    println!("the first solution after {:.1} s", start.elapsed().as_secs_f64());
     window.harness.key_press(Key::Escape);
     window.harness.run_steps(4);
     // The solver stops where it next looks.

@@ -159,10 +159,9 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
-/// Outer iterations for the sharp frames alone.
+/// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
+/// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
-/// The same where frames are displaced: the start was resampled, which smooths, and the residual-driven weights come late.
-const DISPLACED_OUTER: usize = 8;
 /// Outer iterations of the rounds before the last.
 const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
@@ -560,7 +559,7 @@ impl Run<'_> {
         let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
         // Without blur an iteration costs next to nothing: this solution may converge.
         let alone = deblur::Settings {
-            outer: if start_frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { DISPLACED_OUTER } else { SHARP_OUTER },
+            outer: if start_frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { self.settings.deblur.outer } else { SHARP_OUTER },
             ..self.settings.deblur.clone()
         };
         let first = if shaken.is_empty() { alone.clone() } else { for_estimates(&alone) };
@@ -643,11 +642,13 @@ impl Run<'_> {
             }
             solution = None;
         }
-        let solution = match solution.or(base.filter(|_| shaken.is_empty() && first == alone)) {
-            Some(found) => found,
-            // No shaken frame is left: the sharp ones alone, as the user wants them.
-            None => {
-                self.solved("sharp frames", "alone", &alone, |run| run.solve(&start_frames, &placed, &initial, pad, &alone, 0.90, 0.98))?
+        let solution = match (solution, base) {
+            (Some(found), _) => found,
+            (None, Some(base)) if shaken.is_empty() && first == alone => base,
+            // No shaken frame is left: the sharp ones alone, as the user wants them, from what they were for the estimates.
+            (None, base) => {
+                let from = base.map_or(initial, |found| found.irradiance);
+                self.solved("sharp frames", "alone", &alone, |run| run.solve(&start_frames, &placed, &from, pad, &alone, 0.90, 0.98))?
             }
         };
         self.progress("finishing", 0.99)?;

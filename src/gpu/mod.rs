@@ -85,8 +85,8 @@ const TURN: Duration = Duration::from_millis(15);
 const FEWEST: usize = 24;
 /// Beyond this it is the steps themselves that take long.
 const LONG: Duration = Duration::from_millis(250);
-/// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 4e8 pixels times taps per second; 0.4 s.
-const BUDGET_CPU: f64 = 1.5e8;
+/// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 1e9 pixels times taps per second; 0.4 s.
+const BUDGET_CPU: f64 = 4e8;
 /// Of a GPU: the slowest integrated ones make about 2e10; 50 ms.
 const BUDGET_GPU: f64 = 1e9;
 
@@ -326,19 +326,6 @@ impl Gpu {
         let buffer = self.plane(label, values.len())?;
         self.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(values));
         Ok(buffer)
-    }
-
-    /// A read-only storage buffer that holds `values` of a plain type.
-    pub fn table<T: bytemuck::Pod>(&self, label: &str, values: &[T]) -> wgpu::Buffer {
-        let bytes: &[u8] = bytemuck::cast_slice(values);
-        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some(label),
-            size: (bytes.len().max(16).next_multiple_of(4)) as u64,
-            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        self.queue.write_buffer(&buffer, 0, bytes);
-        buffer
     }
 
     /// A uniform buffer that holds `bytes`.

@@ -452,6 +452,7 @@ impl Solver {
             if divisor > session.parameters.divisor.max(1) {
                 // Reduced frames have less noise and shorter blurs: half the iterations show what there is to see.
                 settings.deblur.inner = settings.deblur.inner.div_ceil(2);
+                settings.deblur.outer = settings.deblur.outer.div_ceil(2);
             }
             let outcome = pipeline::merge_with(
                 &mut self.engine,

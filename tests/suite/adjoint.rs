@@ -214,6 +214,16 @@ fn several_passes_equal_one() {
     }
 }
 
+/// 512 base warps are bound at a time.
+#[test]
+fn more_base_warps_than_a_binding_holds_are_done_in_parts() {
+    let pose = |i: i32| Pose::planar(0.3 * f64::from(i % 25), 0.3 * f64::from(i / 25), 0.02 * f64::from(i % 7), 1.0 / 600.0);
+    let tsf = Tsf::new(900.0, (0..600).map(pose).collect()).expect("valid");
+    assert!(TapSet::direct(&tsf, 17, 9).bases.len() > 512);
+    let case = Case::direct("600 poses", &tsf, (17, 9), 10, Interpolation::Bilinear);
+    case.check_with(case.blur.scratch_wanted());
+}
+
 #[test]
 fn scratch_is_shared_without_traces() {
     let scratch = Scratch::new(gpu(), ScratchSize { planes: 40 * 60 * 110, copy: 300 * 200 }, 3).expect("fits");

@@ -110,6 +110,9 @@ fn large_brackets_fit_the_memory_that_there_is() {
     for (size, shaken, limit) in [(small, 2, 4_000_000_000), (small, 3, 4_000_000_000), (large, 2, 8_000_000_000)] {
         let planned = memory(size, shaken, limit).expect("fits");
         assert!(planned.bytes <= limit && planned.streamed, "{planned:?}");
+        // The table of docs/PERFORMANCE.md.
+        let (most, least) = (memory(size, shaken, u64::MAX).expect("fits"), memory(size, shaken, 1).expect_err("does not fit"));
+        println!("{size:?}, {shaken} shaken: {} bytes; {least}", most.bytes);
     }
     // With more of it everything stays on the device.
     let roomy = memory(small, 2, 16_000_000_000).expect("fits");
