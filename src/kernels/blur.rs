@@ -310,7 +310,7 @@ struct Chunk {
     adjoint: wgpu::Buffer,
 }
 
-/// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/tap_sum.wgsl.
+/// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/common/taps.wgsl.
 fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
     for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
         let weight = |m: usize| run.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
