@@ -20,11 +20,6 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<uniform> bases: array<Base, 512>;
-@group(0) @binding(2) var image: texture_2d<f32>;
 @group(0) @binding(3) var<storage, read_write> latent_r: array<f32>;
 @group(0) @binding(4) var<storage, read_write> latent_g: array<f32>;
 @group(0) @binding(5) var<storage, read_write> latent_b: array<f32>;
-
-fn pixel(i: u32) -> vec3f {
-    return textureLoad(image, texel(i), 0).xyz;
-}

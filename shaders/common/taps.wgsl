@@ -23,11 +23,6 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<uniform> table: array<vec4i, 4096>;
-@group(0) @binding(2) var image: texture_2d<f32>;
-
-fn pixel(i: i32) -> vec3f {
-    return textureLoad(image, texel(u32(i)), 0).xyz;
-}
 
 // Consecutive pixels of a column.
 struct Pixels {
@@ -39,7 +34,7 @@ struct Pixels {
 
 fn four(i: i32) -> mat4x3f {
     let row = params.in_stride;
-    return mat4x3f(pixel(i), pixel(i + row), pixel(i + 2 * row), pixel(i + 3 * row));
+    return mat4x3f(pixel(u32(i)), pixel(u32(i + row)), pixel(u32(i + 2 * row)), pixel(u32(i + 3 * row)));
 }
 
 // The sum over the taps of `span` groups from `first` on, for TALL pixels from p on.
@@ -75,7 +70,7 @@ fn taps(p: vec2i, first: u32, span: u32) -> Pixels {
                 a = mat4x3f(a[1], a[2], a[3], b[0]);
                 b = mat4x3f(b[1], b[2], b[3], c[0]);
                 c = mat4x3f(c[1], c[2], c[3], d[0]);
-                d = mat4x3f(d[1], d[2], d[3], pixel(i));
+                d = mat4x3f(d[1], d[2], d[3], pixel(u32(i)));
                 i += row;
                 sum.a += more.x * a;
                 sum.b += more.x * b;

@@ -17,11 +17,6 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<uniform> bases: array<Base, 512>;
-@group(0) @binding(2) var image: texture_2d<f32>;
-
-fn pixel(i: u32) -> vec3f {
-    return textureLoad(image, texel(i), 0).xyz;
-}
 
 // Interpolation within a row of 4 or 6 pixels. Written out, as is the sum over rows, since some drivers do not unroll loops.
 fn row4(i: u32, w: vec4f) -> vec3f {

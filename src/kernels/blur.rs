@@ -17,12 +17,15 @@ use std::ops::Range;
 use std::sync::OnceLock;
 
 pub(super) const PADDED: &str = source!("common/plane", "common/texels", "padded");
-pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp");
-pub(super) const WARP_DIRECT: &str = source!("common/plane", "common/texels", "common/pose", "common/warp", "warp_direct");
-pub(super) const WARP_ADJOINT: &str = source!("common/plane", "common/texels", "common/pose", "common/adjoint", "warp_adjoint");
-pub(super) const WARP_ADJOINT_NEAR: &str = source!("common/plane", "common/texels", "common/pose", "common/adjoint", "warp_adjoint_near");
-pub(super) const TAP_SUM: &str = source!("common/texels", "common/taps", "tap_sum");
-pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/taps", "tap_adjoint");
+pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/image", "common/pose", "common/warp", "warp");
+pub(super) const WARP_DIRECT: &str =
+    source!("common/plane", "common/texels", "common/image", "common/pose", "common/warp", "common/output", "warp_direct");
+pub(super) const WARP_ADJOINT: &str =
+    source!("common/plane", "common/texels", "common/image", "common/pose", "common/adjoint", "warp_adjoint");
+pub(super) const WARP_ADJOINT_NEAR: &str =
+    source!("common/plane", "common/texels", "common/image", "common/pose", "common/adjoint", "warp_adjoint_near");
+pub(super) const TAP_SUM: &str = source!("common/texels", "common/image", "common/taps", "common/output", "tap_sum");
+pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/image", "common/taps", "tap_adjoint");
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -581,7 +584,7 @@ impl Blur {
             _pad: 0,
         };
         let parts = [r, g, b, scratch.copy.binding()];
-        kernels.padded.step_parts(gpu, &params, &parts, [width.div_ceil(16) as u32, rows.len().div_ceil(8) as u32, 1])
+        kernels.padded.step_parts(gpu, &params, &parts, grid(params.out_size, (16, 8), 1))
     }
 
     /// Steps of `frame = K latent`, of one channel or three: as many as `scratch` is for.

@@ -18,7 +18,7 @@ const HALF_ULP: f64 = 1.0 / (1u64 << 24) as f64;
 const SIZES: [(usize, usize); 8] = [(1, 1), (1, 7), (7, 1), (17, 9), (16, 8), (33, 65), (300, 5), (6001, 3)];
 /// Around a workgroup, around a workgroup of workgroups.
 const COUNTS: [usize; 9] = [1, 2, 127, 128, 129, 1000, 16383, 16384, 16500];
-/// More values than one row of workgroups (32 768 of 128) holds.
+/// More values than one row of workgroups (4096 of 1024) holds.
 const MANY: usize = 4096 * 1024 + 1003;
 
 fn k() -> &'static Kernels {
