@@ -40,6 +40,7 @@ pub mod preview;
 pub mod psf;
 pub mod register;
 pub mod response;
+mod sampling;
 pub mod synth;
 pub mod tonemap;
 pub mod triage;

@@ -78,6 +78,35 @@ pub fn project(h: &DMat3, p: DVec2) -> DVec2 {
     DVec2::new(q.x / q.z, q.y / q.z)
 }
 
+/// [`project`] for many points: affine motions need no division.
+#[derive(Clone, Copy, Debug)]
+pub struct Projection {
+    h: DMat3,
+    affine: bool,
+}
+
+impl Projection {
+    /// That of `h`.
+    pub fn new(h: DMat3) -> Self {
+        Self { h, affine: h.x_axis.z == 0.0 && h.y_axis.z == 0.0 && h.z_axis.z == 1.0 }
+    }
+
+    /// Whether it needs no division: even steps stay even.
+    pub fn is_affine(&self) -> bool {
+        self.affine
+    }
+
+    /// Where it takes `p`.
+    #[inline]
+    pub fn of(&self, p: DVec2) -> DVec2 {
+        if self.affine {
+            self.h.x_axis.truncate() * p.x + self.h.y_axis.truncate() * p.y + self.h.z_axis.truncate()
+        } else {
+            project(&self.h, p)
+        }
+    }
+}
+
 /// Index, row by row, of the pixel of a `width` x `height` frame nearest to where `h` (centred pixels) takes the pixel (x, y); `None` outside.
 pub fn nearest_pixel(h: &DMat3, width: usize, height: usize, x: usize, y: usize) -> Option<usize> {
     let centre = DVec2::new(0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));

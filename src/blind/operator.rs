@@ -7,10 +7,12 @@
 //! fit of the TSFs against that luminance by wider ones, and the two drive each other on, round by round.
 
 use crate::image::Plane;
-use crate::pose::project;
+use crate::pose::Projection;
+use crate::sampling::{split, weights, wide};
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
+use std::sync::Mutex;
 
 /// K of one TSF between a latent grid (frame plus `pad` pixels on every side) and a frame.
 pub struct Operator {
@@ -18,13 +20,65 @@ pub struct Operator {
     pad: usize,
     bases: Vec<Base>,
     energy: f32,
+    spare: Mutex<Vec<Vec<f32>>>,
 }
+
+/// dx, dy, weight.
+type Tap = (isize, isize, f32);
 
 /// One warp and its shifts, the warp's array reaching `margin` pixels beyond the frame.
 struct Base {
     inverse: DMat3,
     margin: usize,
-    taps: Vec<(i32, i32, f32)>,
+    taps: Vec<Tap>,
+}
+
+/// Neighbouring pixels of a row of a base's array that see neighbouring pixels of the latent grid.
+struct Run<'a> {
+    /// First pixel in the row, and their number.
+    first: usize,
+    count: usize,
+    /// First of the 4 x 4 pixels of the latent grid around the first one.
+    at: usize,
+    /// Weights of the neighbours' columns and rows.
+    x: [&'a [f32]; 4],
+    y: [&'a [f32]; 4],
+}
+
+/// Coordinates of the pixels of a block along one axis: pixel k of it sees `from` + `whole[k]` + `rest[k]`, and k more along the row.
+struct Cells {
+    from: isize,
+    whole: [f32; BLOCK],
+    rest: [f32; BLOCK],
+}
+
+impl Default for Cells {
+    fn default() -> Self {
+        Self { from: 0, whole: [0.0; BLOCK], rest: [0.0; BLOCK] }
+    }
+}
+
+impl Cells {
+    /// From the coordinates of the first and the last pixel of the block, between which they run evenly where `even`; else from that of each
+    /// pixel, `at(k)`, less `slope` k.
+    #[inline]
+    fn fill(&mut self, first: f64, last: f64, at: impl Fn(usize) -> f64, even: bool, slope: f64) {
+        let (from, rest) = split(first);
+        self.from = from;
+        let step = ((last - first) / (BLOCK - 1) as f64 - slope) as f32;
+        if even && step.abs() < 1.0 / BLOCK as f32 {
+            for k in 0..BLOCK {
+                let t = rest + step * k as f32;
+                let whole = f32::from(u8::from(t >= 1.0)) - f32::from(u8::from(t < 0.0));
+                (self.whole[k], self.rest[k]) = (whole, t - whole);
+            }
+        } else {
+            for k in 0..BLOCK {
+                let (whole, rest) = split(at(k));
+                (self.whole[k], self.rest[k]) = ((whole - from) as f32, rest);
+            }
+        }
+    }
 }
 
 impl Operator {
@@ -37,12 +91,13 @@ impl Operator {
             .iter()
             .enumerate()
             .filter_map(|(b, h)| {
-                let taps: Vec<(i32, i32, f32)> = set.taps.iter().filter(|t| t.base == b).map(|t| (t.dx, t.dy, t.weight as f32)).collect();
-                let margin = taps.iter().map(|t| t.0.unsigned_abs().max(t.1.unsigned_abs())).max()? as usize;
+                let own = set.taps.iter().filter(|t| t.base == b);
+                let taps: Vec<Tap> = own.map(|t| (t.dx as isize, t.dy as isize, t.weight as f32)).collect();
+                let margin = taps.iter().map(|t| t.0.unsigned_abs().max(t.1.unsigned_abs())).max()?;
                 Some(Base { inverse: h.inverse(), margin, taps })
             })
             .collect();
-        Self { frame: (width, height), pad, bases, energy }
+        Self { frame: (width, height), pad, bases, energy, spare: Mutex::default() }
     }
 
     /// Sum of the squared weights of the blur at the frame's centre: the scale of KᵀK's diagonal.
@@ -59,35 +114,31 @@ impl Operator {
     pub fn forward(&self, latent: &[f32]) -> Vec<f32> {
         let (w, h) = self.frame;
         let lw = self.latent().0;
-        let warped: Vec<Vec<f32>> = self
-            .bases
-            .iter()
-            .map(|base| {
-                let wide = w + 2 * base.margin;
-                let mut warped = vec![0.0f32; wide * (h + 2 * base.margin)];
-                warped.par_chunks_exact_mut(wide).enumerate().for_each(|(j, row)| {
-                    self.walk(base, j, |i, at, wx, wy| {
-                        let along = |k: usize| {
-                            let v = &latent[at + k * lw..][..4];
-                            wx[0] * v[0] + wx[1] * v[1] + wx[2] * v[2] + wx[3] * v[3]
-                        };
-                        row[i] = wy[0] * along(0) + wy[1] * along(1) + wy[2] * along(2) + wy[3] * along(3);
-                    });
-                });
-                warped
-            })
-            .collect();
         let mut out = vec![0.0f32; w * h];
-        // Row by row: a row stays in the cache while all taps add to it.
-        out.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
-            for (base, warped) in self.bases.iter().zip(&warped) {
-                let m = base.margin as i32;
-                for &(dx, dy, weight) in &base.taps {
-                    let from = &warped[(y + (m - dy) as usize) * (w + 2 * base.margin) + (m - dx) as usize..][..w];
-                    row.iter_mut().zip(from).for_each(|(o, v)| *o += weight * v);
-                }
-            }
-        });
+        let mut warped = self.scratch();
+        for base in &self.bases {
+            let (m, length) = (base.margin, w + 2 * base.margin);
+            warped.clear();
+            warped.resize(length * (h + 2 * m), 0.0);
+            let warp = |j: usize, to: &mut [f32]| {
+                self.walk(base, j, |run| {
+                    let to = &mut to[run.first..][..run.count];
+                    for b in 0..4 {
+                        let from = &latent[run.at + b * lw..][..run.count + 3];
+                        for a in 0..4 {
+                            let weights = run.x[a].iter().zip(run.y[b]);
+                            to.iter_mut().zip(weights).zip(&from[a..]).for_each(|((t, (x, y)), v)| *t += x * y * v);
+                        }
+                    }
+                });
+            };
+            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| wide(|| warp(j, to)));
+            let sum = |y: usize, to: &mut [f32]| {
+                add_taps(to, &warped, &base.taps, |dx, dy| (y + m).strict_add_signed(-dy) * length + m.strict_add_signed(-dx));
+            };
+            out.par_chunks_exact_mut(w).enumerate().for_each(|(y, to)| wide(|| sum(y, to)));
+        }
+        self.done(warped);
         out
     }
 
@@ -96,53 +147,107 @@ impl Operator {
         let (w, h) = self.frame;
         let lw = self.latent().0;
         let n = lw * self.latent().1;
-        self.bases
-            .par_iter()
-            .map(|base| {
-                let m = base.margin;
-                let wide = w + 2 * m;
-                let mut warped = vec![0.0f32; wide * (h + 2 * m)];
-                warped.par_chunks_exact_mut(wide).enumerate().for_each(|(j, to)| {
-                    for &(dx, dy, weight) in &base.taps {
-                        let (ox, y) = ((m as i32 - dx) as usize, j as i32 - (m as i32 - dy));
-                        if y >= 0 && y < h as i32 {
-                            let row = &frame[y as usize * w..][..w];
-                            to[ox..ox + w].iter_mut().zip(row).for_each(|(o, v)| *o += weight * v);
+        // Zeros around the frame, so that every tap reads whole rows.
+        let zeros = 2 * self.bases.iter().map(|b| b.margin).max().unwrap_or(0);
+        let wide_frame = w + 2 * zeros;
+        let mut around = vec![0.0f32; wide_frame * (h + 2 * zeros)];
+        for (row, to) in frame.chunks_exact(w).zip(around[zeros * wide_frame..].chunks_exact_mut(wide_frame)) {
+            to[zeros..zeros + w].copy_from_slice(row);
+        }
+        let each = |base: &Base| {
+            let (m, length) = (base.margin, w + 2 * base.margin);
+            let (mut warped, mut out) = (self.scratch(), self.scratch());
+            warped.clear();
+            warped.resize(length * (h + 2 * m), 0.0);
+            let sum = |j: usize, to: &mut [f32]| {
+                let at = |v: usize, d: isize| (v + zeros - m).strict_add_signed(d);
+                add_taps(to, &around, &base.taps, |dx, dy| at(j, dy) * wide_frame + at(0, dx));
+            };
+            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| wide(|| sum(j, to)));
+            out.clear();
+            out.resize(n, 0.0);
+            let mut spread = |j: usize, from: &[f32]| {
+                self.walk(base, j, |run| {
+                    let from = &from[run.first..][..run.count];
+                    for b in 0..4 {
+                        let to = &mut out[run.at + b * lw..][..run.count + 3];
+                        for a in 0..4 {
+                            let weights = run.x[a].iter().zip(run.y[b]);
+                            to[a..].iter_mut().zip(weights).zip(from).for_each(|((t, (x, y)), v)| *t += x * y * v);
                         }
                     }
                 });
-                let mut out = vec![0.0f32; n];
-                for (j, row) in warped.chunks_exact(wide).enumerate() {
-                    self.walk(base, j, |i, at, wx, wy| {
-                        for (k, share) in wy.iter().enumerate() {
-                            let v = share * row[i];
-                            out[at + k * lw..][..4].iter_mut().zip(wx).for_each(|(o, x)| *o += x * v);
-                        }
-                    });
-                }
-                out
-            })
-            .reduce(|| vec![0.0; n], add)
+            };
+            for (j, from) in warped.chunks_exact(length).enumerate() {
+                wide(|| spread(j, from));
+            }
+            self.done(warped);
+            out
+        };
+        let sum = self.bases.par_iter().map(each).reduce_with(|a, b| {
+            let sum = add(a, &b);
+            self.done(b);
+            sum
+        });
+        sum.unwrap_or_else(|| vec![0.0; n])
     }
 
-    /// Calls `f(i, index, weights along x, along y)` for the pixels of row `j` of a base's array whose 4 x 4 neighbours, the first of which is
-    /// at `index`, the latent grid holds.
+    /// A vector to use for a while, of any length and content: memory that is fresh from the system costs more than what is done with it.
+    fn scratch(&self) -> Vec<f32> {
+        self.spare.lock().expect("no holder panics").pop().unwrap_or_default()
+    }
+
+    fn done(&self, scratch: Vec<f32>) {
+        self.spare.lock().expect("no holder panics").push(scratch);
+    }
+
+    /// Calls `f` with the runs of row `j` of a base's array whose 4 x 4 neighbours the latent grid holds.
     #[inline]
-    fn walk(&self, base: &Base, j: usize, mut f: impl FnMut(usize, usize, [f32; 4], [f32; 4])) {
+    fn walk(&self, base: &Base, j: usize, mut f: impl FnMut(&Run)) {
         let (w, h) = self.frame;
-        let (lw, lh) = self.latent();
+        let (lw, lh) = (self.latent().0 as isize, self.latent().1 as isize);
         let centre = DVec2::new((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
         let shift = centre + DVec2::splat(self.pad as f64);
-        let affine = base.inverse.x_axis.z == 0.0 && base.inverse.y_axis.z == 0.0;
-        let q = |i: usize| DVec2::new(i as f64, j as f64) - DVec2::splat(base.margin as f64) - centre;
-        let (first, step) = (project(&base.inverse, q(0)) + shift, DVec2::new(base.inverse.x_axis.x, base.inverse.x_axis.y));
-        for i in 0..w + 2 * base.margin {
-            let p = if affine { first + i as f64 * step } else { project(&base.inverse, q(i)) + shift };
-            let (x, y) = (p.x.floor(), p.y.floor());
-            if x < 1.0 || y < 1.0 || x + 2.0 >= lw as f64 || y + 2.0 >= lh as f64 {
-                continue;
+        let inverse = Projection::new(base.inverse);
+        let start = DVec2::new(0.0, j as f64) - DVec2::splat(base.margin as f64) - centre;
+        let look = |i: usize| inverse.of(start + DVec2::new(i as f64, 0.0)) + shift;
+        let length = w + 2 * base.margin;
+        let (mut along, mut down) = (Cells::default(), Cells::default());
+        let (mut x, mut y) = ([[0.0f32; BLOCK]; 4], [[0.0f32; BLOCK]; 4]);
+        for block in (0..length).step_by(BLOCK) {
+            let count = BLOCK.min(length - block);
+            let (first, last) = (look(block), look(block + BLOCK - 1));
+            along.fill(first.x, last.x, |k| look(block + k).x - k as f64, inverse.is_affine(), 1.0);
+            down.fill(first.y, last.y, |k| look(block + k).y, inverse.is_affine(), 0.0);
+            for k in 0..BLOCK {
+                let (u, v) = (weights(along.rest[k]), weights(down.rest[k]));
+                for a in 0..4 {
+                    (x[a][k], y[a][k]) = (u[a], v[a]);
+                }
             }
-            f(i, (y as usize - 1) * lw + x as usize - 1, cubic((p.x - x) as f32), cubic((p.y - y) as f32));
+            let mut k = 0;
+            while k < count {
+                let (dx, dy) = (along.whole[k], down.whole[k]);
+                let mut end = k + 1;
+                while end < count && along.whole[end] == dx && down.whole[end] == dy {
+                    end += 1;
+                }
+                // Pixel k + dx of row dy, and one before it and two behind, have to be there.
+                let (column, row) = (along.from + dx as isize, down.from + dy as isize);
+                let from = (k as isize).max(1 - column);
+                let to = (end as isize).min(lw - 2 - column);
+                if from < to && row >= 1 && row + 2 < lh {
+                    let part = from as usize..to as usize;
+                    f(&Run {
+                        first: block + part.start,
+                        count: part.len(),
+                        at: ((row - 1) * lw + column + from - 1) as usize,
+                        x: x.each_ref().map(|x| &x[part.clone()]),
+                        y: y.each_ref().map(|y| &y[part.clone()]),
+                    });
+                }
+                k = end;
+            }
         }
     }
 
@@ -151,14 +256,14 @@ impl Operator {
         let (w, h) = self.frame;
         let mut inside = vec![true; w * h];
         for base in &self.bases {
-            let (m, wide) = (base.margin as i32, w + 2 * base.margin);
+            let (m, wide) = (base.margin, w + 2 * base.margin);
             let mut seen = vec![false; wide * (h + 2 * base.margin)];
             for (j, row) in seen.chunks_exact_mut(wide).enumerate() {
-                self.walk(base, j, |i, _, _, _| row[i] = true);
+                self.walk(base, j, |run| row[run.first..][..run.count].fill(true));
             }
             inside.par_chunks_exact_mut(w).enumerate().for_each(|(y, row)| {
                 for &(dx, dy, _) in &base.taps {
-                    let from = &seen[(y + (m - dy) as usize) * wide + (m - dx) as usize..][..w];
+                    let from = &seen[(y + m).strict_add_signed(-dy) * wide + m.strict_add_signed(-dx)..][..w];
                     row.iter_mut().zip(from).for_each(|(o, v)| *o &= v);
                 }
             });
@@ -172,14 +277,28 @@ impl Operator {
     }
 }
 
-/// Weights of cubic convolution (Keys 1981, a = -1/2) at fraction `t`.
+/// Values of a row that stay in registers while taps add to them.
+const BLOCK: usize = 32;
+
+/// `row` += Σ weight · `from[at(dx, dy)..]` over `taps`.
 #[inline]
-fn cubic(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+fn add_taps(row: &mut [f32], from: &[f32], taps: &[Tap], at: impl Fn(isize, isize) -> usize) {
+    let (blocks, rest) = row.as_chunks_mut::<BLOCK>();
+    let done = blocks.len() * BLOCK;
+    for (k, block) in blocks.iter_mut().enumerate() {
+        let mut sum = *block;
+        for &(dx, dy, weight) in taps {
+            let values: &[f32; BLOCK] = from[at(dx, dy) + k * BLOCK..][..BLOCK].try_into().expect("a block");
+            sum.iter_mut().zip(values).for_each(|(s, v)| *s += weight * v);
+        }
+        *block = sum;
+    }
+    for &(dx, dy, weight) in taps {
+        rest.iter_mut().zip(&from[at(dx, dy) + done..]).for_each(|(s, v)| *s += weight * v);
+    }
 }
 
-fn add(mut a: Vec<f32>, b: Vec<f32>) -> Vec<f32> {
-    a.iter_mut().zip(&b).for_each(|(x, y)| *x += y);
+fn add(mut a: Vec<f32>, b: &[f32]) -> Vec<f32> {
+    a.iter_mut().zip(b).for_each(|(x, y)| *x += y);
     a
 }

@@ -7,7 +7,8 @@
 //!
 //! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
 //!
-//! then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu) elsewhere (at most fourfold, at least 1/e) for s = 1, 1/2, 1/4, ... until
+//! with K roughly in the matrix and exactly on the right ([`TapSet::rough`]), then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu)
+//! elsewhere (at most fourfold, at least 1/e) for s = 1, 1/2, 1/4, ... until
 //! the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with these weights) does not rise. The data term is quadratic in E: with
 //! the first form a bracket without a sharp frame needs half the outer iterations that exp(s·δu) in both directions needs.
 //! λ is a pure number: the data term counts in units of the noise, u in natural logarithms. With [`Prior::Collaborative`] total variation
@@ -90,7 +91,7 @@ impl Default for Settings {
             inner: 16,
             tolerance: 5e-3,
             robust: 1.0,
-            settled: 0.3,
+            settled: 0.5,
             reweight: true,
             interpolation: Interpolation::Bicubic,
             memory_limit: None,
@@ -194,6 +195,8 @@ const DISPLACED: f64 = 4.0;
 /// K of a frame that is not in place.
 struct Operator {
     blur: Blur,
+    /// About the same for less, in the matrix of a step; `None` for a frame that is only displaced.
+    rough: Option<Blur>,
     interpolation: Interpolation,
     still: bool,
     energy: f32,
@@ -212,6 +215,26 @@ impl Moving {
     fn forward(&self, solver: &Solver, latent: &[wgpu::Buffer], frame: &[wgpu::Buffer]) -> Vec<Step> {
         let kernels = solver.kernels.blur(self.operator.interpolation);
         self.operator.blur.forward(solver.gpu, kernels, &solver.state.scratch, latent, frame)
+    }
+
+    /// Steps of `latent += Kᵀ W K of`, roughly, for channels `group`; `between` receives W K of.
+    fn curvature(
+        &self,
+        solver: &Solver,
+        group: &Range<usize>,
+        of: &[wgpu::Buffer],
+        between: &[wgpu::Buffer],
+        latent: &[wgpu::Buffer],
+    ) -> Vec<Step> {
+        let Solver { gpu, kernels, state, .. } = solver;
+        let blur = self.operator.rough.as_ref().unwrap_or(&self.operator.blur);
+        let own = kernels.blur(self.operator.interpolation);
+        let mut steps = blur.forward(gpu, own, &state.scratch, of, between);
+        for (weight, values) in self.weight[group.clone()].iter().zip(between) {
+            steps.extend(kernels.linear.multiply(gpu, weight, values, solver.counts().1));
+        }
+        steps.extend(blur.adjoint(gpu, own, &state.scratch, between, latent, 1.0));
+        steps
     }
 
     /// Steps of `latent += factor Kᵀ frame`.
@@ -307,11 +330,13 @@ impl Layout {
             let still = tsf.single().is_some();
             let interpolation = if still { STILL } else { interpolation };
             let taps = TapSet::new(tsf, frame.0, frame.1, interpolation);
-            let blur = Blur::new(gpu, kernels.blur(interpolation), &taps, frame, pad);
-            Operator { blur, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
+            let about = |taps: &TapSet| Blur::new(gpu, kernels.blur(interpolation), taps, frame, pad);
+            let blur = about(&taps);
+            let rough = (!still).then(|| about(&TapSet::rough(tsf, frame.0, frame.1, interpolation)));
+            Operator { blur, rough, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
         };
         let operators: Vec<Option<Operator>> = tsfs.iter().map(|t| (!t.is_identity()).then(|| operator(t))).collect();
-        let blurs = || operators.iter().flatten().map(|o| &o.blur);
+        let blurs = || operators.iter().flatten().flat_map(|o| std::iter::once(&o.blur).chain(&o.rough));
         let rows = blurs().map(Blur::rows_at_once).fold(1 + 2 * HALO.max(REACH), usize::max);
         if !gpu.rows_fit(rows, latent) {
             return Err(Error::Adapter(format!(
@@ -327,7 +352,7 @@ impl Layout {
         let (wanted, needed) = (scratch(Blur::scratch_wanted), scratch(Blur::scratch_needed));
         // All bases at once while they are small (fewer dispatches), half a gigabyte at most.
         let most = (1 << 25).min(gpu.max_texels());
-        let shaken = blurs().count();
+        let shaken = operators.iter().flatten().count();
         let need = Need {
             latent: n,
             frame: m,
@@ -673,7 +698,7 @@ impl<'a> Solver<'a> {
     /// One iteration of the conjugate gradients of some channels.
     fn iteration(&self, group: &Range<usize>) -> Vec<Step> {
         let (s, linear) = (&self.state, &self.kernels.linear);
-        let (n, m) = self.counts();
+        let n = self.counts().0;
         let (flat, square) = (partials_1d(self.gpu, n), partials_2d(self.gpu, self.latent));
         let sum = |count, slot, shift| linear.sum(self.gpu, &s.partials, &s.scalars, group.clone(), count, slot, shift);
         let mut steps = Vec::new();
@@ -682,11 +707,7 @@ impl<'a> Solver<'a> {
             steps.extend(linear.scale(self.gpu, &s.irradiance[c], &s.direction[k], &s.weight[c], &s.product[k], &s.back[k], n));
         }
         for moving in self.moving() {
-            steps.extend(moving.forward(self, &s.product, &s.predicted));
-            for (k, c) in group.clone().enumerate() {
-                steps.extend(linear.multiply(self.gpu, &moving.weight[c], &s.predicted[k], m));
-            }
-            steps.extend(moving.adjoint(self, &s.predicted, &s.back, 1.0));
+            steps.extend(moving.curvature(self, group, &s.product, &s.predicted, &s.back));
         }
         for (k, c) in group.clone().enumerate() {
             let (e, b, p, q) = (&s.irradiance[c], &s.back[k], &s.direction[k], &s.product[k]);

@@ -8,7 +8,8 @@ use super::model::{Chart, Coordinates};
 use super::whole_frame::{Row, WholeFrame};
 use crate::image::Plane;
 use crate::nonnegative::{coordinate_descent, gram};
-use crate::pose::{Pose, project};
+use crate::pose::{Pose, Projection, project};
+use crate::sampling::{cubic, cubic_with_gradient, wide};
 use glam::{DMat3, DVec2};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -69,9 +70,9 @@ impl<'a> Evidence<'a> {
 
     /// Weighted differences that `pose` makes of the latent irradiance: its column of A.
     fn column(&self, pose: &Pose, focal: f64) -> Vec<f32> {
-        let turn = self.back * pose.rotation(focal).inverse();
+        let turn = Projection::new(self.back * pose.rotation(focal).inverse());
         let t = DVec2::new(pose.t_x, pose.t_y);
-        let v: Vec<f32> = self.pixels.iter().map(|q| cubic(self.latent, project(&turn, *q - t) + self.origin)).collect();
+        let v: Vec<f32> = wide(|| self.pixels.iter().map(|q| cubic(self.latent, turn.of(*q - t) + self.origin)).collect());
         self.rows.iter().map(|&(a, b, k)| k * (v[b as usize] - v[a as usize])).collect()
     }
 
@@ -236,19 +237,17 @@ impl<'a> Evidence<'a> {
     /// Latent irradiance under every pixel as the pose sees it, and its derivatives by the chart's coordinates.
     fn look(&self, chart: &Chart, pose: &Pose) -> (Vec<f32>, Vec<[f32; 5]>) {
         let inverse = pose.rotation(chart.focal).inverse();
-        let turn = self.back * inverse;
+        let (turn, inverse) = (Projection::new(self.back * inverse), Projection::new(inverse));
         let base = linear_part(&self.back);
         let t = DVec2::new(pose.t_x, pose.t_y);
-        self.pixels
-            .iter()
-            .map(|q| {
-                let (v, g) = cubic_with_gradient(self.latent, project(&turn, *q - t) + self.origin);
-                let g = DVec2::new(f64::from(g[0]), f64::from(g[1]));
-                let (gx, gy) = (g.dot(base[0]), g.dot(base[1]));
-                // Where the pose moves to, the point that a pixel looks at moves away from.
-                (v, chart.motion(project(&inverse, *q - t)).map(|m| (-(gx * m.x + gy * m.y)) as f32))
-            })
-            .unzip()
+        let one = |q: &DVec2| {
+            let (v, g) = cubic_with_gradient(self.latent, turn.of(*q - t) + self.origin);
+            let g = DVec2::new(f64::from(g[0]), f64::from(g[1]));
+            let (gx, gy) = (g.dot(base[0]), g.dot(base[1]));
+            // Where the pose moves to, the point that a pixel looks at moves away from.
+            (v, chart.motion(inverse.of(*q - t)).map(|m| (-(gx * m.x + gy * m.y)) as f32))
+        };
+        wide(|| self.pixels.iter().map(one).unzip())
     }
 }
 
@@ -271,57 +270,4 @@ fn normal(a: &DMatrix<f32>, b: &[f32]) -> (DMatrix<f64>, DVector<f64>) {
             (gram(&part).cast::<f64>(), part.tr_mul(&b).cast::<f64>())
         })
         .reduce(|| (DMatrix::zeros(n, n), DVector::zeros(n)), |(g, c), (g2, c2)| (g + g2, c + c2))
-}
-
-/// Weights of cubic convolution (Keys 1981, a = -1/2) at fraction `t`.
-#[inline]
-fn cubic_weights(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
-}
-
-/// Their derivatives.
-#[inline]
-fn cubic_slopes(t: f32) -> [f32; 4] {
-    let t2 = t * t;
-    [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)]
-}
-
-/// The 4 x 4 pixels around `p`, row by row, the nearest edge pixel outside, and the fractions.
-#[inline]
-fn neighbours(plane: &Plane, p: DVec2) -> ([[f32; 4]; 4], f32, f32) {
-    let (fx, fy) = (p.x.floor(), p.y.floor());
-    let (x, y) = (fx as isize - 1, fy as isize - 1);
-    let inside = x >= 0 && y >= 0 && x + 3 < plane.width as isize && y + 3 < plane.height as isize;
-    let rows = std::array::from_fn(|j| {
-        if inside {
-            let i = (y as usize + j) * plane.width + x as usize;
-            [plane.data[i], plane.data[i + 1], plane.data[i + 2], plane.data[i + 3]]
-        } else {
-            std::array::from_fn(|i| plane.clamped(x + i as isize, y + j as isize))
-        }
-    });
-    (rows, (p.x - fx) as f32, (p.y - fy) as f32)
-}
-
-fn along(w: &[f32; 4], row: &[f32; 4]) -> f32 {
-    w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]
-}
-
-/// Cubic reading of `plane` at `p` (pixels).
-#[inline]
-fn cubic(plane: &Plane, p: DVec2) -> f32 {
-    let (rows, u, v) = neighbours(plane, p);
-    let (wx, wy) = (cubic_weights(u), cubic_weights(v));
-    along(&wy, &rows.map(|r| along(&wx, &r)))
-}
-
-/// Cubic reading of `plane` at `p` (pixels) and its gradient.
-#[inline]
-fn cubic_with_gradient(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
-    let (rows, u, v) = neighbours(plane, p);
-    let (wx, wy) = (cubic_weights(u), cubic_weights(v));
-    let values = rows.map(|r| along(&wx, &r));
-    let gx = cubic_slopes(u);
-    (along(&wy, &values), [along(&wy, &rows.map(|r| along(&gx, &r))), along(&cubic_slopes(v), &values)])
 }

@@ -88,9 +88,13 @@ pub struct TapSet {
 /// off by more than half of this, and the errors of a path's many poses average out. Splitting a pose between two bases would double the
 /// taps for no smaller error (it blurs by as much).
 const TOLERANCE: f64 = 0.6;
+/// The same for [`TapSet::rough`].
+const ROUGH_TOLERANCE: f64 = 1.2;
 
 /// Taps below this fraction of the largest are dropped: together they are below the 8-bit quantisation of any pixel.
 const NEGLIGIBLE: f64 = 5e-4;
+/// The same for [`TapSet::rough`]: a few per cent of the weight are dropped.
+const ROUGHLY_NEGLIGIBLE: f64 = 5e-3;
 
 /// What a load of a warp, which has its own arithmetic, costs in taps: a bicubic warp of sixteen and its adjoint take 100 ns per pixel of three
 /// channels on lavapipe, a tap and its adjoint 2.1 ns.
@@ -103,13 +107,28 @@ impl TapSet {
     /// The cheaper of [`TapSet::direct`] and [`TapSet::shifted`] on a `width` x `height` frame: a single pose as itself, which costs one
     /// warp; a path, as base warps and shifts.
     pub fn new(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
-        if let Some(motion) = tsf.single().filter(|_| !tsf.is_identity()) {
-            return Self::still(&motion);
+        match tsf.single().filter(|_| !tsf.is_identity()) {
+            Some(motion) => Self::still(&motion),
+            None => Self::cheaper(Self::direct(tsf, width, height), Self::shifted(tsf, width, height, interpolation), interpolation),
         }
+    }
+
+    /// About the same blur at about half the cost, for the matrix of a Gauss-Newton step: the residual that the step starts from decides where
+    /// the iteration ends, the matrix only how fast. Poses are displaced by up to 0.6 px.
+    pub fn rough(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
+        let rough = Self::shifted_within(tsf, width, height, interpolation, ROUGH_TOLERANCE, ROUGHLY_NEGLIGIBLE);
+        Self::cheaper(Self::new(tsf, width, height, interpolation), rough, interpolation)
+    }
+
+    /// The one that costs less, by default the first.
+    fn cheaper(a: Self, b: Self, interpolation: Interpolation) -> Self {
         let warp = WARP_COST * (2 * interpolation.support()).pow(2) as f64;
-        let (direct, shifted) = (Self::direct(tsf, width, height), Self::shifted(tsf, width, height, interpolation));
-        let cost = warp * shifted.bases.len() as f64 + shifted.taps.len() as f64;
-        if warp * direct.bases.len() as f64 <= cost { direct } else { shifted }
+        let cost = |set: &Self| match set.bases.len() {
+            // Nothing shifts them: no taps.
+            n if n == set.taps.len() => warp * n as f64,
+            n => warp * n as f64 + set.taps.len() as f64,
+        };
+        if cost(&a) <= cost(&b) { a } else { b }
     }
 
     /// Every pose a base warp of its own that nothing shifts; poses that no pixel tells apart are one ([`INDISTINGUISHABLE`]).
@@ -121,14 +140,19 @@ impl TapSet {
 
     /// Base warps, to the nearest of which each pose's rotation is rounded (by 0.3 px at most, anywhere), and the shifts that are left.
     pub fn shifted(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
+        Self::shifted_within(tsf, width, height, interpolation, TOLERANCE, NEGLIGIBLE)
+    }
+
+    /// [`TapSet::shifted`] with base warps for rotations within `tolerance` pixels, less taps below the part `negligible` of the largest.
+    fn shifted_within(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation, tolerance: f64, negligible: f64) -> Self {
         let flat = tsf.poses.iter().all(|p| p.theta_x_deg == 0.0 && p.theta_y_deg == 0.0);
-        let (bases, parts) = if flat { roll_bases(tsf, width, height) } else { general_bases(tsf, width, height) };
+        let (bases, parts) = if flat { roll_bases(tsf, width, height, tolerance) } else { general_bases(tsf, width, height, tolerance) };
         let mut grid: BTreeMap<(usize, i32, i32), f64> = BTreeMap::new();
         for (base, t, weight) in parts {
             splat(interpolation, t, |dx, dy, w| *grid.entry((base, dy, dx)).or_default() += weight * w);
         }
         let largest = grid.values().fold(0.0f64, |a, w| a.max(w.abs()));
-        grid.retain(|_, w| w.abs() > NEGLIGIBLE * largest);
+        grid.retain(|_, w| w.abs() > negligible * largest);
         let sum: f64 = grid.values().sum();
         let taps = grid.iter().map(|(&(base, dy, dx), &w)| Tap { base, dx, dy, weight: w / sum }).collect();
         Self { bases, taps }
@@ -175,9 +199,9 @@ pub(super) fn splat(interpolation: Interpolation, t: DVec2, mut f: impl FnMut(i3
 type Parts = (Vec<DMat3>, Vec<(usize, DVec2, f64)>);
 
 /// Roll angles, as few as leave none of the poses' farther than half the tolerance.
-fn roll_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
+fn roll_bases(tsf: &Tsf, width: usize, height: usize, tolerance: f64) -> Parts {
     let corner = 0.5 * (width as f64).hypot(height as f64);
-    let span = (TOLERANCE / corner).to_degrees();
+    let span = (tolerance / corner).to_degrees();
     let mut order: Vec<&Pose> = tsf.poses.iter().collect();
     order.sort_by(|a, b| a.theta_z_deg.total_cmp(&b.theta_z_deg));
     let (mut bases, mut parts) = (Vec::new(), Vec::new());
@@ -193,7 +217,7 @@ fn roll_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
 }
 
 /// For poses with pitch and yaw: a base for each group of poses whose rotations differ by little more than a translation.
-fn general_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
+fn general_bases(tsf: &Tsf, width: usize, height: usize, tolerance: f64) -> Parts {
     let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
     let samples: Vec<DVec2> =
         [-1.0, -0.5, 0.0, 0.5, 1.0].iter().flat_map(|&j| [-1.0, -0.5, 0.0, 0.5, 1.0].map(|i| DVec2::new(i * x, j * y))).collect();
@@ -211,7 +235,7 @@ fn general_bases(tsf: &Tsf, width: usize, height: usize) -> Parts {
         };
         let near = moved.iter().enumerate().map(|(i, m)| (i, distance(m))).min_by(|a, b| a.1.0.total_cmp(&b.1.0));
         let (base, shift) = match near {
-            Some((i, (worst, mean))) if worst < 0.5 * TOLERANCE => (i, mean),
+            Some((i, (worst, mean))) if worst < 0.5 * tolerance => (i, mean),
             _ => {
                 bases.push(h);
                 moved.push(to);

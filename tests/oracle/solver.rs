@@ -11,6 +11,8 @@ pub type Planes = [Vec<f64>; 3];
 /// One frame: what it saw, and the matrix from the latent grid to it.
 pub struct Frame {
     pub matrix: Matrix,
+    /// The one that stands for it on the left of a step's equation.
+    pub rough: Matrix,
     pub exposure: Planes,
     pub mask: Vec<f64>,
     pub exposure_time: f64,
@@ -101,7 +103,7 @@ impl Problem {
         sum
     }
 
-    /// δu of `[E Σ Kᵀ W K E + Dᵀ w D] δu = E Σ Kᵀ W (B - K E) - Dᵀ w D u`.
+    /// δu of `[E Σ Kᵀ W K E + Dᵀ w D] δu = E Σ Kᵀ W (B - K E) - Dᵀ w D u`, K in brackets roughly.
     pub fn step(&self, log: &Planes, weights: &[Weights]) -> Planes {
         let n = self.latent.0 * self.latent.1;
         let edge: Vec<f64> = lengths(log, self.epsilon, self.latent).iter().map(|l| self.lambda / l).collect();
@@ -119,8 +121,12 @@ impl Problem {
                     let residual = w.observation[c][i] - w.weight[c][i] * predicted;
                     for &(j, v) in row {
                         b[j] += e[j] * v * residual;
+                    }
+                }
+                for (row, weight) in f.rough.rows.iter().zip(&w.weight[c]) {
+                    for &(j, v) in row {
                         for &(k, t) in row {
-                            a[(j, k)] += e[j] * v * w.weight[c][i] * t * e[k];
+                            a[(j, k)] += e[j] * v * weight * t * e[k];
                         }
                     }
                 }

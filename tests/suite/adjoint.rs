@@ -416,6 +416,36 @@ fn a_pose_is_never_far_from_its_base_warp() {
     assert_eq!((taps.bases.len(), taps.taps.len(), taps.taps[0].dx, taps.taps[0].dy), (1, 1, 1, 0));
 }
 
+#[test]
+fn the_rough_blur_costs_half_and_is_about_the_same() {
+    // A path as cameras draw it: a tenth of a degree of roll, a dozen pixels.
+    let at = |i: usize| {
+        let t = f64::from(i as u32) / 60.0;
+        Pose::planar(9.0 * (2.0 * t).sin(), 6.0 * t * t - 0.9 * (11.0 * t).cos(), 0.5 * (2.5 * t).cos(), 1.0 + 0.5 * (5.0 * t).sin())
+    };
+    let (tsf, size) = (Tsf::new(900.0, (0..60).map(at).collect()).expect("valid"), (640, 480));
+    let (exact, rough) = [TapSet::new, TapSet::rough].map(|f| f(&tsf, size.0, size.1, Interpolation::Bicubic)).into();
+    assert!(3 * rough.bases.len() <= 2 * exact.bases.len(), "{} of {} base warps", rough.bases.len(), exact.bases.len());
+    assert!(3 * rough.taps.len() <= 2 * exact.taps.len(), "{} of {} taps", rough.taps.len(), exact.taps.len());
+    assert!((rough.taps.iter().map(|t| t.weight).sum::<f64>() - 1.0).abs() < 1e-12);
+    // Power at a frequency: what K^T K is made of.
+    let power = |set: &TapSet, f: DVec2| {
+        let (re, im) = set.taps.iter().fold((0.0, 0.0), |(re, im), t| {
+            let (sin, cos) = (std::f64::consts::TAU * f.dot(DVec2::new(f64::from(t.dx), f64::from(t.dy)))).sin_cos();
+            (re + t.weight * cos, im + t.weight * sin)
+        });
+        re * re + im * im
+    };
+    for f in [(0.01, 0.0), (0.0, 0.03), (0.05, 0.02), (0.1, -0.1), (0.2, 0.15), (0.4, 0.0), (0.3, 0.4)] {
+        let f = DVec2::from(f);
+        let (a, b) = (power(&exact, f), power(&rough, f));
+        assert!((a - b).abs() <= 0.02 + 0.1 * a, "at {f}: {b} for {a}");
+    }
+    // A pose alone stays what it is.
+    let one = Tsf::new(900.0, vec![Pose::planar(1.3, -0.4, 0.2, 1.0)]).expect("valid");
+    assert_eq!(TapSet::rough(&one, 640, 480, Interpolation::Bicubic).bases, TapSet::new(&one, 640, 480, Interpolation::Bicubic).bases);
+}
+
 /// K and Kᵀ of every band on a device whose bindings hold less than a plane.
 #[test]
 fn planes_larger_than_a_binding_are_bound_in_bands() {

@@ -22,10 +22,13 @@ fn path(n: usize, from: [f64; 3], to: [f64; 3], bend: f64) -> Tsf {
 
 #[test]
 fn the_blur_of_a_plane_and_its_adjoint_are_the_matrix() {
-    let (size, pad) = ((11, 8), 4);
+    // Wider than a block of the rows, and not by whole blocks.
+    let (size, pad) = ((43, 8), 4);
     let yaw =
         Tsf::new(40.0, vec![Pose { theta_y_deg: 2.0, ..Pose::planar(0.3, -0.8, 1.0, 0.5) }, Pose::planar(-1.2, 0.6, -2.0, 0.5)]).unwrap();
-    for tsf in [path(7, [-2.0, 1.0, -3.0], [1.5, -1.2, 4.0], 0.7), yaw] {
+    // So far turned that a block passes several rows.
+    let turned = path(3, [0.5, 0.0, 8.0], [-0.5, 0.3, 9.0], 0.2);
+    for tsf in [path(7, [-2.0, 1.0, -3.0], [1.5, -1.2, 4.0], 0.7), yaw, turned] {
         let taps = TapSet::shifted(&tsf, size.0, size.1, Interpolation::Bicubic);
         let k = oracle::of_taps(&taps, Interpolation::Bicubic, size, pad);
         let operator = Operator::new(&tsf, size.0, size.1, pad);

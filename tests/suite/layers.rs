@@ -13,6 +13,7 @@ const TABLE: &[(&str, &[&str])] = &[
     // Mathematics without images.
     ("fft", &[]),
     ("nonnegative", &[]),
+    ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
     ("response", &["error", "image", "exposure", "mask"]),
     ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
@@ -22,8 +23,8 @@ const TABLE: &[(&str, &[&str])] = &[
     ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft"]),
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
-    ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative"]),
-    ("blind", &["image", "merge", "pose", "psf", "tsf"]),
+    ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative", "sampling"]),
+    ("blind", &["image", "merge", "pose", "psf", "sampling", "tsf"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),

@@ -44,6 +44,14 @@ fn matrix(tsf: &Tsf, pad: usize) -> blur::Matrix {
     blur::of_taps(&TapSet::new(tsf, SIZE.0, SIZE.1, INTERPOLATION), INTERPOLATION, SIZE, pad)
 }
 
+/// What stands for it in the matrix of a step.
+fn rough(tsf: &Tsf, pad: usize) -> blur::Matrix {
+    if tsf.single().is_some() {
+        return matrix(tsf, pad);
+    }
+    blur::of_taps(&TapSet::rough(tsf, SIZE.0, SIZE.1, INTERPOLATION), INTERPOLATION, SIZE, pad)
+}
+
 /// A frame of the truth under `tsf` with its noise.
 fn observe(tsf: Tsf, exposure_time: f64, pad: usize, seed: u64) -> Observation {
     let (truth, matrix, noise_curves) = (truth(pad), matrix(&tsf, pad), curves());
@@ -96,6 +104,7 @@ fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Setti
 fn problem(observations: &[Observation], pad: usize, settings: &Settings) -> Problem {
     let frame = |o: &Observation| Frame {
         matrix: matrix(&o.tsf, pad),
+        rough: rough(&o.tsf, pad),
         exposure: planes(&o.exposure),
         mask: f64s(&o.mask.data),
         exposure_time: o.exposure_time,

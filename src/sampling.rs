@@ -1,0 +1,79 @@
+//! Reading a plane between its pixels by cubic convolution (Keys 1981, a = -1/2), as the estimators do some hundred million times.
+
+use crate::image::Plane;
+use glam::DVec2;
+
+/// What `f` returns, with the widest vector instructions that this processor has for its loops: the program is built for the oldest.
+#[inline]
+pub fn wide<R>(f: impl FnOnce() -> R) -> R {
+    pulp::Arch::new().dispatch(f)
+}
+
+/// `v` as a whole number that is not greater, and the rest. `f64::floor` is a call of a library function on processors that are not known to round.
+#[inline]
+pub fn split(v: f64) -> (isize, f32) {
+    let towards_zero = v as isize;
+    let whole = towards_zero - isize::from(v < towards_zero as f64);
+    (whole, (v - whole as f64) as f32)
+}
+
+/// Weights of the four pixels around fraction `t`.
+#[inline]
+pub fn weights(t: f32) -> [f32; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+}
+
+/// Their derivatives.
+#[inline]
+pub fn slopes(t: f32) -> [f32; 4] {
+    let t2 = t * t;
+    [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)]
+}
+
+#[inline]
+fn along(w: &[f32; 4], row: &[f32; 4]) -> f32 {
+    w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]
+}
+
+/// Calls `f` with each of the four rows of four pixels around pixel (`x`, `y`), the nearest edge pixel outside.
+#[inline]
+fn rows(plane: &Plane, x: isize, y: isize, mut f: impl FnMut(usize, &[f32; 4])) {
+    let (x, y) = (x - 1, y - 1);
+    if x >= 0 && y >= 0 && x + 4 <= plane.width as isize && y + 4 <= plane.height as isize {
+        let first = y as usize * plane.width + x as usize;
+        for j in 0..4 {
+            let row = &plane.data[first + j * plane.width..][..4];
+            f(j, row.try_into().expect("four pixels"));
+        }
+    } else {
+        for j in 0..4 {
+            f(j, &std::array::from_fn(|i| plane.clamped(x + i as isize, y + j as isize)));
+        }
+    }
+}
+
+/// `plane` at `p` (pixels).
+#[inline]
+pub fn cubic(plane: &Plane, p: DVec2) -> f32 {
+    let ((x, u), (y, v)) = (split(p.x), split(p.y));
+    let (wx, wy) = (weights(u), weights(v));
+    let mut sum = 0.0;
+    rows(plane, x, y, |j, row| sum += wy[j] * along(&wx, row));
+    sum
+}
+
+/// `plane` at `p` (pixels) and its gradient.
+#[inline]
+pub fn cubic_with_gradient(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
+    let ((x, u), (y, v)) = (split(p.x), split(p.y));
+    let (wx, wy, sx, sy) = (weights(u), weights(v), slopes(u), slopes(v));
+    let (mut value, mut gx, mut gy) = (0.0, 0.0, 0.0);
+    rows(plane, x, y, |j, row| {
+        let here = along(&wx, row);
+        value += wy[j] * here;
+        gx += wy[j] * along(&sx, row);
+        gy += sy[j] * here;
+    });
+    (value, [gx, gy])
+}
