@@ -53,6 +53,8 @@ const SHAKEN: f64 = 1.5;
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
 /// measure up to 1.6.
 const SURELY_SHAKEN: f64 = 3.0;
+/// Extent beside the frames that stand still, as they are, from which that is confirmed: between the two, since their noise widens it.
+const CONFIRMED: f64 = 2.25;
 
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
@@ -150,10 +152,25 @@ impl Run<'_> {
             none_still = all_moved(&self.coarse_extents(used, at(0.2), at(0.3))?);
         }
         if !none_still {
-            return Ok((None, shaken));
+            let still: Vec<usize> = doubted.iter().copied().filter(|i| !shaken.contains(i)).collect();
+            return Ok((None, self.confirmed(shaken, &still)));
         }
         let found = self.joint(used, true, at(0.3), to)?;
         Ok((found, doubted.to_vec()))
+    }
+
+    /// Those of the frames `moved` that are blurred beside the frames `still`, too: a coarse look at frames that all are noisy errs by some pixels
+    /// now and then, and a sharp frame that counts as shaken is missed where the blurs of the others are estimated.
+    fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Vec<usize> {
+        if moved.is_empty() || still.is_empty() {
+            return moved;
+        }
+        let frames = self.bracket.frames();
+        let sharp: Vec<bool> = (0..frames.len()).map(|i| still.contains(&i)).collect();
+        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
+        let (scene, _) = self.start(still, 0);
+        let (w, h) = self.bracket.size();
+        moved.into_iter().filter(|&i| self.estimate(i, &scene).0.is_none_or(|t| tsf::extent(&t, w, h) > CONFIRMED)).collect()
     }
 
     /// Frame of `used` to start from, and the next best: the shortest are nearly always the least blurred.
