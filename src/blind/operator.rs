@@ -184,12 +184,13 @@ impl Operator {
             self.done(warped);
             out
         };
-        let sum = self.bases.par_iter().map(each).reduce_with(|a, b| {
-            let sum = add(a, &b);
-            self.done(b);
-            sum
-        });
-        sum.unwrap_or_else(|| vec![0.0; n])
+        // One after another, so that the same frames give the same sum whichever thread was first.
+        let mut sum = vec![0.0f32; n];
+        for part in self.bases.par_iter().map(each).collect::<Vec<_>>() {
+            sum.iter_mut().zip(&part).for_each(|(a, b)| *a += b);
+            self.done(part);
+        }
+        sum
     }
 
     /// A vector to use for a while, of any length and content: memory that is fresh from the system costs more than what is done with it.
@@ -296,9 +297,4 @@ fn add_taps(row: &mut [f32], from: &[f32], taps: &[Tap], at: impl Fn(isize, isiz
     for &(dx, dy, weight) in taps {
         rest.iter_mut().zip(&from[at(dx, dy) + done..]).for_each(|(s, v)| *s += weight * v);
     }
-}
-
-fn add(mut a: Vec<f32>, b: &[f32]) -> Vec<f32> {
-    a.iter_mut().zip(b).for_each(|(x, y)| *x += y);
-    a
 }

@@ -166,7 +166,10 @@ fn normal(reference: &Tone, d: &Difference, sigma: f32, freedom: usize, scale: f
             }
             n
         })
-        .reduce(Normal::empty, Normal::add)
+        .collect::<Vec<_>>()
+        .into_iter()
+        // In order: the same frames are placed alike whichever thread was first.
+        .fold(Normal::empty(), Normal::add)
 }
 
 /// The motion of kind `model` near `start` that takes the reference to the frame.

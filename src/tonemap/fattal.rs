@@ -56,7 +56,7 @@ fn attenuation(log: &Plane, alpha: f32, beta: f32) -> Plane {
                 scale * dx.hypot(dy)
             })
             .collect();
-        let mean = (gradient.par_iter().map(|v| f64::from(*v)).sum::<f64>() / gradient.len() as f64) as f32;
+        let mean = (gradient.iter().map(|v| f64::from(*v)).sum::<f64>() / gradient.len() as f64) as f32;
         let a = (alpha * mean).max(1e-6);
         // Gradients far below α would be lifted without bound, and noise with them.
         let phi = |g: f32| (g.max(0.1 * a) / a).powf(beta - 1.0);

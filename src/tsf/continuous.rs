@@ -261,13 +261,18 @@ fn linear_part(h: &DMat3) -> [DVec2; 2] {
 fn normal(a: &DMatrix<f32>, b: &[f32]) -> (DMatrix<f64>, DVector<f64>) {
     let n = a.ncols();
     let starts: Vec<usize> = (0..a.nrows()).step_by(2048).collect();
-    starts
-        .into_par_iter()
-        .map(|s| {
-            let count = 2048.min(a.nrows() - s);
-            let part = a.rows(s, count).clone_owned();
-            let b = DVector::from_column_slice(&b[s..s + count]);
-            (gram(&part).cast::<f64>(), part.tr_mul(&b).cast::<f64>())
-        })
-        .reduce(|| (DMatrix::zeros(n, n), DVector::zeros(n)), |(g, c), (g2, c2)| (g + g2, c + c2))
+    let part = |s: usize| {
+        let count = 2048.min(a.nrows() - s);
+        let part = a.rows(s, count).clone_owned();
+        let b = DVector::from_column_slice(&b[s..s + count]);
+        (gram(&part), part.tr_mul(&b))
+    };
+    let parts: Vec<(DMatrix<f32>, DVector<f32>)> = starts.into_par_iter().map(part).collect();
+    // One after another: the sum does not depend on which thread was first.
+    let mut sum = (DMatrix::zeros(n, n), DVector::zeros(n));
+    for (g, c) in parts {
+        sum.0 += g.cast::<f64>();
+        sum.1 += c.cast::<f64>();
+    }
+    sum
 }
