@@ -4,4 +4,3 @@
 fn pixel(i: u32) -> vec3f {
     return textureLoad(image, texel(i), 0).xyz;
 }
-

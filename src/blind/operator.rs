@@ -20,6 +20,7 @@ pub struct Operator {
     pad: usize,
     bases: Vec<Base>,
     energy: f32,
+    /// Vectors to be used again.
     spare: Mutex<Vec<Vec<f32>>>,
 }
 
@@ -115,11 +116,9 @@ impl Operator {
         let (w, h) = self.frame;
         let lw = self.latent().0;
         let mut out = vec![0.0f32; w * h];
-        let mut warped = self.scratch();
         for base in &self.bases {
             let (m, length) = (base.margin, w + 2 * base.margin);
-            warped.clear();
-            warped.resize(length * (h + 2 * m), 0.0);
+            let mut warped = self.zeros(length * (h + 2 * m));
             let warp = |j: usize, to: &mut [f32]| {
                 self.walk(base, j, |run| {
                     let to = &mut to[run.first..][..run.count];
@@ -137,8 +136,8 @@ impl Operator {
                 add_taps(to, &warped, &base.taps, |dx, dy| (y + m).strict_add_signed(-dy) * length + m.strict_add_signed(-dx));
             };
             out.par_chunks_exact_mut(w).enumerate().for_each(|(y, to)| wide(|| sum(y, to)));
+            self.done(warped);
         }
-        self.done(warped);
         out
     }
 
@@ -150,22 +149,18 @@ impl Operator {
         // Zeros around the frame, so that every tap reads whole rows.
         let zeros = 2 * self.bases.iter().map(|b| b.margin).max().unwrap_or(0);
         let wide_frame = w + 2 * zeros;
-        let mut around = vec![0.0f32; wide_frame * (h + 2 * zeros)];
+        let mut around = self.zeros(wide_frame * (h + 2 * zeros));
         for (row, to) in frame.chunks_exact(w).zip(around[zeros * wide_frame..].chunks_exact_mut(wide_frame)) {
             to[zeros..zeros + w].copy_from_slice(row);
         }
         let each = |base: &Base| {
             let (m, length) = (base.margin, w + 2 * base.margin);
-            let (mut warped, mut out) = (self.scratch(), self.scratch());
-            warped.clear();
-            warped.resize(length * (h + 2 * m), 0.0);
+            let (mut warped, mut out) = (self.zeros(length * (h + 2 * m)), self.zeros(n));
             let sum = |j: usize, to: &mut [f32]| {
                 let at = |v: usize, d: isize| (v + zeros - m).strict_add_signed(d);
                 add_taps(to, &around, &base.taps, |dx, dy| at(j, dy) * wide_frame + at(0, dx));
             };
             warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| wide(|| sum(j, to)));
-            out.clear();
-            out.resize(n, 0.0);
             let mut spread = |j: usize, from: &[f32]| {
                 self.walk(base, j, |run| {
                     let from = &from[run.first..][..run.count];
@@ -190,16 +185,20 @@ impl Operator {
             sum.iter_mut().zip(&part).for_each(|(a, b)| *a += b);
             self.done(part);
         }
+        self.done(around);
         sum
     }
 
-    /// A vector to use for a while, of any length and content: memory that is fresh from the system costs more than what is done with it.
-    fn scratch(&self) -> Vec<f32> {
-        self.spare.lock().expect("no holder panics").pop().unwrap_or_default()
+    /// A vector to use until [`Operator::done`]: memory that is fresh from the system costs more than what is done with it.
+    fn zeros(&self, count: usize) -> Vec<f32> {
+        let mut vector = self.spare.lock().expect("no holder panics").pop().unwrap_or_default();
+        vector.clear();
+        vector.resize(count, 0.0);
+        vector
     }
 
-    fn done(&self, scratch: Vec<f32>) {
-        self.spare.lock().expect("no holder panics").push(scratch);
+    fn done(&self, vector: Vec<f32>) {
+        self.spare.lock().expect("no holder panics").push(vector);
     }
 
     /// Calls `f` with the runs of row `j` of a base's array whose 4 x 4 neighbours the latent grid holds.

@@ -7,7 +7,7 @@
 //!
 //! `[E Σ_i K_iᵀ W_i K_i E + Dᵀ w D] δu = E Σ_i K_iᵀ W_i (B_i - K_i E) - Dᵀ w D u`
 //!
-//! with K roughly in the matrix and exactly on the right ([`TapSet::rough`]), then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu)
+//! with K roughly in the matrix and exactly on the right ([`TapSet::rougher`]), then tries E·(1 + s·δu) where δu > 0 and E·exp(s·δu)
 //! elsewhere (at most fourfold, at least 1/e) for s = 1, 1/2, 1/4, ... until
 //! the objective `½ Σ W (B - K E)² + λ Σ √(|∇u|² + ε²)` (with these weights) does not rise. The data term is quadratic in E: with
 //! the first form a bracket without a sharp frame needs half the outer iterations that exp(s·δu) in both directions needs.
@@ -195,7 +195,7 @@ const DISPLACED: f64 = 4.0;
 /// K of a frame that is not in place.
 struct Operator {
     blur: Blur,
-    /// About the same for less, in the matrix of a step; `None` for a frame that is only displaced.
+    /// About the same for less, in the matrix of a step; `None` where nothing costs less.
     rough: Option<Blur>,
     interpolation: Interpolation,
     still: bool,
@@ -332,7 +332,7 @@ impl Layout {
             let taps = TapSet::new(tsf, frame.0, frame.1, interpolation);
             let about = |taps: &TapSet| Blur::new(gpu, kernels.blur(interpolation), taps, frame, pad);
             let blur = about(&taps);
-            let rough = (!still).then(|| about(&TapSet::rough(tsf, frame.0, frame.1, interpolation)));
+            let rough = taps.rougher(tsf, frame.0, frame.1, interpolation).map(|rough| about(&rough));
             Operator { blur, rough, interpolation, still, energy: taps.energy() as f32, psf: taps.psf() }
         };
         let operators: Vec<Option<Operator>> = tsfs.iter().map(|t| (!t.is_identity()).then(|| operator(t))).collect();

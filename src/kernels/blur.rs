@@ -334,7 +334,7 @@ impl Blur {
     pub fn new(gpu: &Gpu, kernels: &BlurKernels, taps: &TapSet, frame: (usize, usize), pad: usize) -> Self {
         let range = |f: fn(&crate::tsf::Tap) -> i32| taps.taps.iter().map(f).fold((i32::MAX, i32::MIN), |(a, b), v| (a.min(v), b.max(v)));
         let (shift_x, shift_y) = (range(|t| t.dx), range(|t| t.dy));
-        let direct = taps.taps.len() == taps.bases.len() && taps.taps.iter().enumerate().all(|(i, t)| (t.base, t.dx, t.dy) == (i, 0, 0));
+        let direct = taps.is_direct();
         let half = 0.5 * DVec2::new(frame.0 as f64 + f64::from(shift_x.1 - shift_x.0), frame.1 as f64 + f64::from(shift_y.1 - shift_y.0));
         let s = kernels.support as f64;
         let spreads: Vec<(f64, f64)> = taps.bases.iter().map(|h| spread(h, half)).collect();

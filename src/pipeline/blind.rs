@@ -85,10 +85,11 @@ pub(super) fn settled(passing: &[usize], moved: &[usize]) -> Option<Vec<usize>> 
 }
 
 impl Run<'_> {
-    /// Masks of a bracket of which no frame counts as sharp.
-    fn all_masks(&self) -> Vec<Plane> {
+    /// Masks of a bracket of which the frames `still` alone count as sharp.
+    fn masks_with(&self, still: &[usize]) -> Vec<Plane> {
         let frames = self.bracket.frames();
-        mask::masks(frames, &vec![false; frames.len()], self.settings.alpha as f32, &self.motions)
+        let sharp: Vec<bool> = (0..frames.len()).map(|i| still.contains(&i)).collect();
+        mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions)
     }
 
     /// Luminance of the frame `i`.
@@ -97,13 +98,13 @@ impl Run<'_> {
     }
 
     fn luminance_frames(&self, used: &[usize]) -> Vec<Frame> {
-        let masks = self.all_masks();
+        let masks = self.masks_with(&[]);
         used.iter().map(|&i| self.luminance_frame(i, &masks)).collect()
     }
 
     /// The frames `used` merged as they are placed, without deblurring.
     fn blurred_merge(&self, used: &[usize]) -> Rgb {
-        let masks = self.all_masks();
+        let masks = self.masks_with(&[]);
         let (aligned, seen) = self.placed(used, &masks, 0);
         merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used)
     }
@@ -165,9 +166,7 @@ impl Run<'_> {
         if moved.is_empty() || still.is_empty() {
             return moved;
         }
-        let frames = self.bracket.frames();
-        let sharp: Vec<bool> = (0..frames.len()).map(|i| still.contains(&i)).collect();
-        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
+        self.masks = self.masks_with(still);
         let (scene, _) = self.start(still, 0);
         let (w, h) = self.bracket.size();
         moved.into_iter().filter(|&i| self.estimate(i, &scene).0.is_none_or(|t| tsf::extent(&t, w, h) > CONFIRMED)).collect()
@@ -205,7 +204,7 @@ impl Run<'_> {
             return Ok(Vec::new());
         }
         let (mx, my) = (most.x as usize, most.y as usize);
-        let masks = self.all_masks();
+        let masks = self.masks_with(&[]);
         let first = self.luminance_frame(frames[0], &masks);
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);

@@ -88,12 +88,12 @@ pub struct TapSet {
 /// off by more than half of this, and the errors of a path's many poses average out. Splitting a pose between two bases would double the
 /// taps for no smaller error (it blurs by as much).
 const TOLERANCE: f64 = 0.6;
-/// The same for [`TapSet::rough`].
+/// The same for [`TapSet::rougher`].
 const ROUGH_TOLERANCE: f64 = 1.2;
 
 /// Taps below this fraction of the largest are dropped: together they are below the 8-bit quantisation of any pixel.
 const NEGLIGIBLE: f64 = 5e-4;
-/// The same for [`TapSet::rough`]: a few per cent of the weight are dropped.
+/// The same for [`TapSet::rougher`]: a few per cent of the weight are dropped.
 const ROUGHLY_NEGLIGIBLE: f64 = 5e-3;
 
 /// What a load of a warp, which has its own arithmetic, costs in taps: a bicubic warp of sixteen and its adjoint take 100 ns per pixel of three
@@ -107,28 +107,29 @@ impl TapSet {
     /// The cheaper of [`TapSet::direct`] and [`TapSet::shifted`] on a `width` x `height` frame: a single pose as itself, which costs one
     /// warp; a path, as base warps and shifts.
     pub fn new(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
-        match tsf.single().filter(|_| !tsf.is_identity()) {
-            Some(motion) => Self::still(&motion),
-            None => Self::cheaper(Self::direct(tsf, width, height), Self::shifted(tsf, width, height, interpolation), interpolation),
+        if let Some(motion) = tsf.single().filter(|_| !tsf.is_identity()) {
+            return Self::still(&motion);
         }
+        let (direct, shifted) = (Self::direct(tsf, width, height), Self::shifted(tsf, width, height, interpolation));
+        if direct.cost(interpolation) <= shifted.cost(interpolation) { direct } else { shifted }
     }
 
-    /// About the same blur at about half the cost, for the matrix of a Gauss-Newton step: the residual that the step starts from decides where
-    /// the iteration ends, the matrix only how fast. Poses are displaced by up to 0.6 px.
-    pub fn rough(tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Self {
+    /// About the same blur as this one of `tsf` at about half the cost, for the matrix of a Gauss-Newton step: the residual that the step starts
+    /// from decides where the iteration ends, the matrix only how fast. Poses are displaced by up to 0.6 px. `None` where that costs no less.
+    pub fn rougher(&self, tsf: &Tsf, width: usize, height: usize, interpolation: Interpolation) -> Option<Self> {
         let rough = Self::shifted_within(tsf, width, height, interpolation, ROUGH_TOLERANCE, ROUGHLY_NEGLIGIBLE);
-        Self::cheaper(Self::new(tsf, width, height, interpolation), rough, interpolation)
+        (rough.cost(interpolation) < self.cost(interpolation)).then_some(rough)
     }
 
-    /// The one that costs less, by default the first.
-    fn cheaper(a: Self, b: Self, interpolation: Interpolation) -> Self {
-        let warp = WARP_COST * (2 * interpolation.support()).pow(2) as f64;
-        let cost = |set: &Self| match set.bases.len() {
-            // Nothing shifts them: no taps.
-            n if n == set.taps.len() => warp * n as f64,
-            n => warp * n as f64 + set.taps.len() as f64,
-        };
-        if cost(&a) <= cost(&b) { a } else { b }
+    /// Whether each tap is a base warp of its own that nothing shifts, as [`TapSet::direct`] makes them.
+    pub fn is_direct(&self) -> bool {
+        self.taps.len() == self.bases.len() && self.taps.iter().enumerate().all(|(i, t)| (t.base, t.dx, t.dy) == (i, 0, 0))
+    }
+
+    /// What K and its adjoint cost, in taps.
+    fn cost(&self, interpolation: Interpolation) -> f64 {
+        let warps = WARP_COST * (2 * interpolation.support()).pow(2) as f64 * self.bases.len() as f64;
+        if self.is_direct() { warps } else { warps + self.taps.len() as f64 }
     }
 
     /// Every pose a base warp of its own that nothing shifts; poses that no pixel tells apart are one ([`INDISTINGUISHABLE`]).

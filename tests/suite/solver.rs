@@ -46,10 +46,10 @@ fn matrix(tsf: &Tsf, pad: usize) -> blur::Matrix {
 
 /// What stands for it in the matrix of a step.
 fn rough(tsf: &Tsf, pad: usize) -> blur::Matrix {
-    if tsf.single().is_some() {
-        return matrix(tsf, pad);
+    match TapSet::new(tsf, SIZE.0, SIZE.1, INTERPOLATION).rougher(tsf, SIZE.0, SIZE.1, INTERPOLATION) {
+        Some(taps) if !tsf.is_identity() => blur::of_taps(&taps, INTERPOLATION, SIZE, pad),
+        _ => matrix(tsf, pad),
     }
-    blur::of_taps(&TapSet::rough(tsf, SIZE.0, SIZE.1, INTERPOLATION), INTERPOLATION, SIZE, pad)
 }
 
 /// A frame of the truth under `tsf` with its noise.
