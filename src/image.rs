@@ -3,6 +3,35 @@
 use crate::error::{Error, Result};
 use rayon::prelude::*;
 
+/// A choice of red, green and blue, at least one of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channels([bool; 3]);
+
+impl Channels {
+    /// Red, green and blue.
+    pub const ALL: Self = Self([true; 3]);
+
+    /// Every choice there is, all three first.
+    pub fn choices() -> impl Iterator<Item = Self> {
+        (1..8u8).rev().map(|bits| Self(std::array::from_fn(|c| bits & (4 >> c) != 0)))
+    }
+
+    /// Which of the channels 0, 1 and 2 are in it.
+    pub fn indices(self) -> impl Iterator<Item = usize> {
+        (0..3).filter(move |&c| self.0[c])
+    }
+
+    /// How many they are.
+    pub fn count(self) -> usize {
+        self.indices().count()
+    }
+
+    /// Their names.
+    pub fn names(self) -> Vec<&'static str> {
+        self.indices().map(|c| ["red", "green", "blue"][c]).collect()
+    }
+}
+
 /// One channel, `width * height` values, row-major, pixel centres at integers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plane {
@@ -168,6 +197,12 @@ impl Rgb {
     pub fn mean(&self) -> Plane {
         let [r, g, b] = &self.0;
         Plane::from_fn(self.width(), self.height(), |x, y| (r.at(x, y) + g.at(x, y) + b.at(x, y)) / 3.0)
+    }
+
+    /// Mean of the given channels.
+    pub fn mean_of(&self, channels: Channels) -> Plane {
+        let n = channels.count() as f32;
+        Plane::from_fn(self.width(), self.height(), |x, y| channels.indices().map(|c| self.0[c].at(x, y)).sum::<f32>() / n)
     }
 
     /// Interleaved `[r, g, b]` of pixel `i` (row-major).

@@ -15,6 +15,7 @@
 
 pub mod baseline;
 pub mod blind;
+pub mod channels;
 pub mod cli;
 pub mod collaborative;
 pub mod colour;

@@ -1,7 +1,7 @@
 //! Masks m of eq. (8): Tukey windows of the intensity, and what is clipped. No irradiance.
 
 use crate::exposure::Frame;
-use crate::image::Plane;
+use crate::image::{Channels, Plane};
 use crate::pose::nearest_pixel;
 use glam::DMat3;
 
@@ -19,28 +19,41 @@ fn low_taper(z: f32, alpha: f32) -> f32 {
     if alpha <= 0.0 || z >= 0.5 * alpha { 1.0 } else { 0.5 * (1.0 - (2.0 * std::f32::consts::PI * z / alpha).cos()) }
 }
 
-/// Grey equivalent of a frame's intensity (Rec. 601 luma).
-pub fn grey(frame: &Frame) -> Plane {
-    let [r, g, b] = &frame.intensity.0;
-    Plane::from_fn(r.width, r.height, |x, y| 0.299 * r.at(x, y) + 0.587 * g.at(x, y) + 0.114 * b.at(x, y))
+/// Rec. 601 luma's weights of red, green and blue.
+const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
+
+/// Grey equivalent of `channels` of a frame's intensity: for all three, Rec. 601 luma.
+fn grey(frame: &Frame, channels: Channels) -> Plane {
+    let planes = &frame.intensity.0;
+    let all: f32 = channels.indices().map(|c| LUMA[c]).sum();
+    let one = |x, y| channels.indices().map(|c| LUMA[c] / all * planes[c].at(x, y)).sum();
+    Plane::from_fn(planes[0].width, planes[0].height, one)
 }
 
-/// Where any channel of the frame is clipped.
-pub fn clipped(frame: &Frame) -> Vec<bool> {
-    let [r, g, b] = &frame.intensity.0;
-    (0..r.data.len()).map(|i| r.data[i] >= CLIPPED || g.data[i] >= CLIPPED || b.data[i] >= CLIPPED).collect()
+/// Where any of `channels` of the frame is clipped.
+pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
+    let planes = &frame.intensity.0;
+    (0..planes[0].data.len()).map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
 }
 
-/// One mask per frame, 0..=1, the same for all channels.
+/// Pixels of a frame of `size` farther than `radius`, along rows and columns, from those where `lost` is true.
+pub fn apart(lost: &[bool], size: (usize, usize), radius: usize) -> Vec<bool> {
+    let (w, h) = size;
+    let near = |v: usize, n: usize| v.saturating_sub(radius)..=(v + radius).min(n - 1);
+    let rows: Vec<bool> = (0..w * h).map(|p| near(p % w, w).any(|x| lost[p / w * w + x])).collect();
+    (0..w * h).map(|p| !near(p / w, h).any(|y| rows[y * w + p % w])).collect()
+}
+
+/// One mask per frame, 0..=1, for all of `channels` together.
 ///
-/// The window's high end applies everywhere, and the mask is 0 wherever any channel is clipped. Its low end applies only where
+/// The window's high end applies everywhere, and the mask is 0 wherever any of them is clipped. Its low end applies only where
 /// a longer frame that is at least as sharp has the pixel in the flat part of its own window: elsewhere the dark values are
 /// the best there is, and their variance already says what they are worth (the low end alone costs 3 dB).
 ///
 /// `motions`: each frame's place, from the reference, centred pixels.
-pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3]) -> Vec<Plane> {
-    let greys: Vec<Plane> = frames.iter().map(grey).collect();
-    let clipped: Vec<Vec<bool>> = frames.iter().map(clipped).collect();
+pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3], channels: Channels) -> Vec<Plane> {
+    let greys: Vec<Plane> = frames.iter().map(|f| grey(f, channels)).collect();
+    let clipped: Vec<Vec<bool>> = frames.iter().map(|f| clipped(f, channels)).collect();
     frames
         .iter()
         .enumerate()

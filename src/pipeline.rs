@@ -1,10 +1,11 @@
 //! The stages in order: a bracket in, irradiance and report out. No mathematics, no files, no printing.
 
+use crate::channels;
 use crate::deblur::{self, Observation, Prior, Solution};
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
 use crate::gpu::Gpu;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::Kernels;
 use crate::mask;
 use crate::merge;
@@ -171,6 +172,20 @@ const PATCH_SIZE: usize = 96;
 /// Pixels around the path of a blur at a patch in which its PSF is looked for.
 const PSF_MARGIN: isize = 3;
 
+/// What the blur of a frame is looked for in: see [`Run::luminances`].
+struct Luminances {
+    latent: Plane,
+    seen: Plane,
+    blurred: Plane,
+    weight: Plane,
+}
+
+impl Luminances {
+    fn frame(&self, base: DMat3) -> WholeFrame<'_> {
+        WholeFrame { latent: &self.latent, pad: 0, blurred: &self.blurred, weight: &self.weight, base }
+    }
+}
+
 struct Run<'a> {
     gpu: &'a Gpu,
     kernels: &'a Kernels,
@@ -180,6 +195,8 @@ struct Run<'a> {
     settings: &'a Settings,
     exposures: Vec<Rgb>,
     masks: Vec<Plane>,
+    /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
+    looks: Vec<(Channels, Option<Plane>)>,
     noise: NoiseModel,
     curves: Vec<[Vec<f32>; 3]>,
     /// Where each frame lies, from the reference (centred pixels), and how that was found.
@@ -248,6 +265,7 @@ pub fn merge_with(
         settings,
         exposures,
         masks: Vec::new(),
+        looks: Vec::new(),
         noise,
         curves,
         motions,
@@ -543,7 +561,7 @@ impl Run<'_> {
         } else if known.iter().all(|k| !k) {
             self.rebase(reference);
         }
-        self.masks = mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions);
+        self.weigh(&sharp, &used);
         if unexplained {
             self.prefer_detail(|i| verdicts[i].detail);
         }
@@ -790,11 +808,7 @@ impl Run<'_> {
     /// Squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred; NaN where it is masked.
     fn unblurred(&self, i: usize, latent: &Rgb) -> Plane {
         let (exposure, mask) = (&self.exposures[i], &self.masks[i]);
-        let (seen, inside) = if self.motions[i] == DMat3::IDENTITY {
-            (latent.clone(), mask.clone())
-        } else {
-            merge::resampled(latent, &mask.map(|_| 1.0), &self.motions[i].inverse(), 0)
-        };
+        let (seen, inside) = self.seen(latent, &self.motions[i]);
         let mask = mask.zip(&inside, |m, k| m * k);
         merge::misfit(&seen, exposure, &mask, &self.curves[i], self.bracket.frames()[i].exposure_time)
     }
@@ -813,35 +827,55 @@ impl Run<'_> {
         if register::distance(&whole, &shift, w, h).1 < 0.5 * SEARCHED { shift } else { whole }
     }
 
-    /// Luminance of frame `i` and its inverse variance, model error included; `latent` lies on its grid.
-    fn luminance(&self, i: usize, latent: &Plane) -> (Plane, Plane) {
+    /// The channels whose mean tells most about the blurs of the frames `blurred` of a scene known from the frames `by`.
+    fn most_telling(&self, blurred: &[usize], by: &[usize]) -> Channels {
+        channels::most_telling(self.bracket.frames(), &self.exposures, blurred, by, &self.noise)
+    }
+
+    /// Masks of all frames, of which `sharp` are sharp, and how the blurs of the others of the frames `used` are looked at.
+    fn weigh(&mut self, sharp: &[bool], used: &[usize]) {
+        let masks = |c| mask::masks(self.bracket.frames(), sharp, self.settings.alpha as f32, &self.motions, c);
+        let (still, moved): (Vec<usize>, Vec<usize>) = used.iter().partition(|&&i| sharp[i]);
+        let by = if still.is_empty() { &moved } else { &still };
+        let look = |i: usize| {
+            let channels = if moved.contains(&i) { self.most_telling(&[i], by) } else { Channels::ALL };
+            (channels, (channels != Channels::ALL).then(|| masks(channels).swap_remove(i)))
+        };
+        self.looks = (0..sharp.len()).map(look).collect();
+        self.masks = masks(Channels::ALL);
+    }
+
+    /// Luminances, the mean of the channels in which the blur of frame `i` is looked for, of the irradiance `latent` and of what the frame at
+    /// `motion` sees of it; of the frame itself; and the frame's inverse variance, model error included.
+    fn luminances(&self, i: usize, latent: &Rgb, motion: &DMat3) -> Luminances {
         let frame = &self.bracket.frames()[i];
         let dt = frame.exposure_time as f32;
-        let exposure = self.exposures[i].mean();
-        let local = merge::gradient_level(latent, 4);
+        let (channels, mask) = (self.looks[i].0, self.looks[i].1.as_ref().unwrap_or(&self.masks[i]));
+        let count = channels.count() as f32;
+        let (seen, inside) = self.seen(latent, motion);
+        let seen = seen.mean_of(channels);
+        let exposure = self.exposures[i].mean_of(channels);
+        let local = merge::gradient_level(&seen, 4);
         let weight = Plane {
             data: (0..exposure.data.len())
                 .map(|p| {
-                    let m = self.masks[i].data[p];
+                    let m = mask.data[p];
                     // An operator is never true to better than some per cent of the structure around a pixel.
                     let variance =
-                        self.noise.variance(f64::from(exposure.data[p])) as f32 / 3.0 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
-                    m * m / variance
+                        self.noise.variance(f64::from(exposure.data[p])) as f32 / count / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
+                    m * m / variance * inside.data[p]
                 })
                 .collect(),
             ..exposure
         };
-        (exposure.map(|v| v / dt), weight)
+        Luminances { latent: latent.mean_of(channels), seen, blurred: exposure.map(|v| v / dt), weight }
     }
 
     /// TSF of frame `i` against the sharp irradiance, about where the frame lies, and what is known of it.
     fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
         let base = self.base(i);
-        let (seen, inside) = self.seen(latent, &base);
-        let latent = latent.mean();
-        let (blurred, weight) = self.luminance(i, &seen);
-        let weight = weight.zip(&inside, |w, k| w * k);
-        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
+        let luminances = self.luminances(i, latent, &base);
+        let frame = luminances.frame(base);
         let search = Search { model: self.settings.model, focal_px: self.settings.focal_px, stop: self.stop.clone() };
         let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
         let detail = json!({
@@ -850,18 +884,17 @@ impl Run<'_> {
             "focal_length": found.focal,
             "models_tried": found.trials,
             "estimated_at_scale": found.scale,
-            "extent_px": tsf::extent(&found.tsf, latent.width, latent.height),
+            "extent_px": tsf::extent(&found.tsf, latent.width(), latent.height()),
             "residual": found.residual,
+            "channels": self.looks[i].0.names(),
         });
         (Some(found.tsf), detail)
     }
 
     /// Patches of frame `i` and their PSFs, as the report has them.
     fn local_psfs(&self, i: usize, latent: &Rgb, tsf: &Tsf) -> Value {
-        let (seen, inside) = self.seen(latent, &tsf.base);
-        let (blurred, weight) = self.luminance(i, &seen);
-        let weight = weight.zip(&inside, |w, k| w * k);
-        let psfs = self.psfs(&seen, &blurred, &weight, tsf);
+        let luminances = self.luminances(i, latent, &tsf.base);
+        let psfs = self.psfs(&luminances.seen, &luminances.blurred, &luminances.weight, tsf);
         json!(
             psfs.iter()
                 .map(|(p, m)| json!({
@@ -892,24 +925,18 @@ impl Run<'_> {
         patches.iter().filter_map(measure).collect()
     }
 
-    /// Luminance of the irradiance `latent` on the grid of a frame at `motion`, and 1 where it reaches.
-    fn seen(&self, latent: &Rgb, motion: &DMat3) -> (Plane, Plane) {
+    /// The irradiance `latent` on the grid of a frame at `motion`, and 1 where it reaches.
+    fn seen<'r>(&self, latent: &'r Rgb, motion: &DMat3) -> (Cow<'r, Rgb>, Plane) {
         let everywhere = self.masks[0].map(|_| 1.0);
         if *motion == DMat3::IDENTITY {
-            return (latent.mean(), everywhere);
+            return (Cow::Borrowed(latent), everywhere);
         }
         let (seen, inside) = merge::resampled(latent, &everywhere, &motion.inverse(), 0);
-        (seen.mean(), inside)
+        (Cow::Owned(seen), inside)
     }
 
     fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
-        let base = tsf.map_or(DMat3::IDENTITY, |t| t.base);
-        let (seen, inside) = self.seen(latent, &base);
-        let latent = latent.mean();
-        let (blurred, weight) = self.luminance(i, &seen);
-        let weight = weight.zip(&inside, |w, k| w * k);
-        let frame = WholeFrame { latent: &latent, pad: 0, blurred: &blurred, weight: &weight, base };
-        tsf.map(|t| frame.refine(t))
+        tsf.map(|t| self.luminances(i, latent, &t.base).frame(t.base).refine(t))
     }
 
     fn finish(

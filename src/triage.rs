@@ -1,7 +1,7 @@
 //! Which frames are sharp: fine structure of each frame, noise taken off, against that of the others.
 
 use crate::exposure::Frame;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::noise::NoiseModel;
 use crate::pose::nearest_pixel;
@@ -65,7 +65,7 @@ struct Luminance {
 }
 
 fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
-    let clipped = mask::clipped(frame);
+    let clipped = mask::clipped(frame, Channels::ALL);
     let dt = frame.exposure_time;
     let mean = x.mean();
     let counts = Plane { data: clipped.iter().map(|c| if *c { 0.0 } else { 1.0 }).collect(), ..mean.clone() };

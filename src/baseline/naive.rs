@@ -5,7 +5,7 @@ use crate::deblur::{self, Observation, Settings};
 use crate::error::Result;
 use crate::exposure::{Bracket, Frame};
 use crate::gpu::Gpu;
-use crate::image::Rgb;
+use crate::image::{Channels, Rgb};
 use crate::kernels::Kernels;
 use crate::mask;
 use crate::merge as start;
@@ -33,7 +33,7 @@ pub fn deblur_each(
     let level = noise::estimate(frames, &exposures, response);
     let curves: Vec<[Vec<f32>; 3]> = frames.iter().map(|f| std::array::from_fn(|c| level.curve(response, c, f.levels))).collect();
     // Without a low taper no frame looks at another, and where they lie does not matter.
-    let masks = mask::masks(frames, &vec![false; frames.len()], 0.0, &vec![DMat3::IDENTITY; frames.len()]);
+    let masks = mask::masks(frames, &vec![false; frames.len()], 0.0, &vec![DMat3::IDENTITY; frames.len()], Channels::ALL);
     let shaken: Vec<usize> = (0..frames.len()).filter(|&i| !tsfs[i].is_identity()).collect();
     let gpu = Gpu::new()?;
     let kernels = Kernels::new(&gpu);
@@ -53,7 +53,7 @@ pub fn deblur_each(
         let solved = deblur::solve(&gpu, &kernels, &[observation], &blurred.map_planes(|p| p.padded(pad)), pad, settings, &mut part)?;
         let dt = frames[i].exposure_time as f32;
         // What the frame clipped stays clipped in the merge; elsewhere the restored exposure takes the place of the intensity.
-        let clipped = mask::clipped(&frames[i]);
+        let clipped = mask::clipped(&frames[i], Channels::ALL);
         let mut exposure = solved.cropped().map_planes(|p| p.map(|v| (v * dt).clamp(0.0, 0.999)));
         for p in exposure.0.iter_mut() {
             p.data.iter_mut().zip(&clipped).filter(|(_, c)| **c).for_each(|(v, _)| *v = 1.0);

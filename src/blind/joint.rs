@@ -2,6 +2,7 @@
 
 use super::luminance::{self, Effort, Frame, chi_squared, operators};
 use crate::image::Plane;
+use crate::mask;
 use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
 use crate::tsf::{self, Tsf, WholeFrame};
@@ -140,11 +141,8 @@ fn warp(latent: &Plane, m: &Pose) -> Plane {
 /// amount of light.
 fn known(frames: &[Frame], radius: usize) -> Vec<bool> {
     let (w, h) = frames[0].blurred.size();
-    let lost = |x: usize, y: usize| frames.iter().all(|f| f.mask.at(x, y) == 0.0);
-    let near = |v: usize, n: usize| v.saturating_sub(radius)..=(v + radius).min(n - 1);
-    let lost: Vec<bool> = (0..w * h).map(|p| lost(p % w, p / w)).collect();
-    let rows: Vec<bool> = (0..w * h).map(|p| near(p % w, w).any(|x| lost[p / w * w + x])).collect();
-    (0..w * h).map(|p| !near(p / w, h).any(|y| rows[y * w + p % w])).collect()
+    let lost: Vec<bool> = (0..w * h).map(|p| frames.iter().all(|f| f.mask.data[p] == 0.0)).collect();
+    mask::apart(&lost, (w, h), radius)
 }
 
 /// One level of the pyramid.

@@ -6,7 +6,7 @@
 //! E exp(δu) elsewhere (at most fourfold, at least 1/e).
 
 use super::operator::Operator;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::tsf::Tsf;
 
 /// One frame's luminance at one size.
@@ -200,21 +200,23 @@ pub fn operators(tsfs: &[Tsf], size: (usize, usize), pad: usize) -> Vec<Operator
 }
 
 impl Frame {
-    /// Luminance of one frame from its exposure (1 = white), mask, noise curves per channel ([`crate::kernels::NOISE_STEPS`] values) and
-    /// exposure time in seconds. The variance is that of the locally smoothed exposure: a pixel's own value would give more weight to
+    /// Luminance of one frame, the mean of `channels`, from its exposure (1 = white), their mask, noise curves per channel
+    /// ([`crate::kernels::NOISE_STEPS`] values) and exposure time in seconds. The variance is that of the locally smoothed exposure: a pixel's own value would give more weight to
     /// what noise made darker.
-    pub fn new(exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64) -> Self {
+    pub fn new(exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64, channels: Channels) -> Self {
+        let count = channels.count() as f32;
         let dt = exposure_time as f32;
         let mut variance = mask.map(|_| 0.0);
-        for (plane, curve) in exposure.0.iter().zip(curves) {
+        for (plane, curve) in channels.indices().map(|c| (&exposure.0[c], &curves[c])) {
             let last = curve.len() - 1;
             for (v, x) in variance.data.iter_mut().zip(&smooth(plane).data) {
                 let noise = curve[((x.clamp(0.0, 1.0).sqrt() * last as f32).round() as usize).min(last)];
-                *v += noise * noise / (9.0 * dt * dt);
+                *v += noise * noise / (count * count * dt * dt);
             }
         }
-        let clipped = (0..mask.data.len()).map(|p| mask.data[p] == 0.0 && exposure.0.iter().any(|c| c.data[p] > CLIPPED)).collect();
-        Self { blurred: exposure.mean().map(|v| v / dt), variance, mask: mask.clone(), clipped }
+        let clipped =
+            (0..mask.data.len()).map(|p| mask.data[p] == 0.0 && channels.indices().any(|c| exposure.0[c].data[p] > CLIPPED)).collect();
+        Self { blurred: exposure.mean_of(channels).map(|v| v / dt), variance, mask: mask.clone(), clipped }
     }
 
     /// The part of `size` pixels whose first is `at`.

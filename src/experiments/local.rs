@@ -3,7 +3,7 @@
 use super::study::{Events, Method, Study};
 use crate::error::Result;
 use crate::exposure::Bracket;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::merge::gradient_level;
 use crate::noise;
@@ -25,7 +25,7 @@ pub(super) fn seen(bracket: &Bracket, response: &Response, i: usize, latent: &Pl
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
     let level = noise::estimate(frames, &exposures, response);
     let dt = frames[i].exposure_time as f32;
-    let (clipped, local, exposure) = (mask::clipped(&frames[i]), gradient_level(latent, 4), exposures[i].mean());
+    let (clipped, local, exposure) = (mask::clipped(&frames[i], Channels::ALL), gradient_level(latent, 4), exposures[i].mean());
     let weight = |p: usize| {
         let x = exposure.data[p];
         let variance = level.variance(f64::from(x)) as f32 / 3.0 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);

@@ -4,7 +4,7 @@ use super::{Event, Run};
 use crate::blind::{self, Frame, Lack, PatchSetup, Start};
 use crate::deblur;
 use crate::error::{Error, Result};
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::merge;
 use crate::pose::project;
@@ -85,33 +85,31 @@ pub(super) fn settled(passing: &[usize], moved: &[usize]) -> Option<Vec<usize>> 
 }
 
 impl Run<'_> {
-    /// Masks of a bracket of which the frames `still` alone count as sharp.
-    fn masks_with(&self, still: &[usize]) -> Vec<Plane> {
+    /// Masks by which the mean of `channels` counts in a bracket of which the frames `still` alone are sharp.
+    fn masks_with(&self, still: &[usize], channels: Channels) -> Vec<Plane> {
         let frames = self.bracket.frames();
         let sharp: Vec<bool> = (0..frames.len()).map(|i| still.contains(&i)).collect();
-        mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions)
+        mask::masks(frames, &sharp, self.settings.alpha as f32, &self.motions, channels)
     }
 
-    /// Luminance of the frame `i`.
-    fn luminance_frame(&self, i: usize, masks: &[Plane]) -> Frame {
-        Frame::new(&self.exposures[i], &masks[i], &self.curves[i], self.bracket.frames()[i].exposure_time)
-    }
-
-    fn luminance_frames(&self, used: &[usize]) -> Vec<Frame> {
-        let masks = self.masks_with(&[]);
-        used.iter().map(|&i| self.luminance_frame(i, &masks)).collect()
+    /// Luminance of the frames `ids`: the mean of `channels`.
+    fn luminance_frames(&self, ids: &[usize], channels: Channels) -> Vec<Frame> {
+        let masks = self.masks_with(&[], channels);
+        let one = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], self.bracket.frames()[i].exposure_time, channels);
+        ids.iter().map(one).collect()
     }
 
     /// The frames `used` merged as they are placed, without deblurring.
     fn blurred_merge(&self, used: &[usize]) -> Rgb {
-        let masks = self.masks_with(&[]);
+        let masks = self.masks_with(&[], Channels::ALL);
         let (aligned, seen) = self.placed(used, &masks, 0);
         merge::irradiance(self.bracket, &aligned, &seen, &self.curves, used)
     }
 
-    /// `luminance` in the colours of `merged`: those of a blurred merge, but they change less across an edge than the luminance does.
-    fn coloured(merged: &Rgb, luminance: &Plane) -> Rgb {
-        let mean = merged.mean();
+    /// `luminance`, the mean of `channels`, in the colours of `merged`: those of a blurred merge, but they change less across an edge than the
+    /// luminance does.
+    fn coloured(merged: &Rgb, luminance: &Plane, channels: Channels) -> Rgb {
+        let mean = merged.mean_of(channels);
         merged.map_planes(|p| {
             let data =
                 p.data.iter().zip(mean.data.iter().zip(&luminance.data)).map(|(c, (m, l))| c * l / m.max(f32::MIN_POSITIVE)).collect();
@@ -122,12 +120,13 @@ impl Run<'_> {
     /// Irradiance to start from where the TSFs of all of the frames `used` are known: no frame shows the scene, and the colour
     /// solver's iterations are dear.
     pub(super) fn start_from_tsfs(&mut self, used: &[usize], tsfs: &[Option<Tsf>]) -> Result<Rgb> {
-        let (frames, merged) = (self.luminance_frames(used), self.blurred_merge(used));
+        let channels = self.most_telling(used, used);
+        let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let (w, h) = self.bracket.size();
         let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().unwrap_or_else(Tsf::identity)).collect();
         let pad = deblur::pad_for(&known.iter().collect::<Vec<_>>(), w, h, (super::LARGEST_PAD * w.max(h) as f64) as usize);
-        let luminance = blind::luminance_of(&frames, &known, &merged.mean(), pad);
-        Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h)))
+        let luminance = blind::luminance_of(&frames, &known, &merged.mean_of(channels), pad);
+        Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h), channels))
     }
 
     /// The TSFs of all of the frames `used` and a scene to start from; `None` when a merge explains them as well or, where the triage was
@@ -166,21 +165,24 @@ impl Run<'_> {
         if moved.is_empty() || still.is_empty() {
             return moved;
         }
-        self.masks = self.masks_with(still);
+        let sharp: Vec<bool> = (0..self.exposures.len()).map(|i| still.contains(&i)).collect();
+        self.weigh(&sharp, &[still, &moved].concat());
         let (scene, _) = self.start(still, 0);
         let (w, h) = self.bracket.size();
         moved.into_iter().filter(|&i| self.estimate(i, &scene).0.is_none_or(|t| tsf::extent(&t, w, h) > CONFIRMED)).collect()
     }
 
-    /// Frame of `used` to start from, and the next best: the shortest are nearly always the least blurred.
-    fn starts(&self, used: &[usize]) -> Vec<Start> {
+    /// Frame of `used` to start from, its luminance the mean of `channels`, and the next best: the shortest are nearly always the least blurred.
+    fn starts(&self, used: &[usize], channels: Channels) -> Vec<Start> {
         let time = |k: usize| self.bracket.frames()[used[k]].exposure_time;
         let mut order: Vec<usize> = (0..used.len()).collect();
         order.sort_by(|&a, &b| time(a).total_cmp(&time(b)));
         if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
             order = vec![r];
         }
-        let alone = |k: usize| merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]).mean();
+        let alone = |k: usize| {
+            merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]).mean_of(channels)
+        };
         order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
@@ -204,8 +206,9 @@ impl Run<'_> {
             return Ok(Vec::new());
         }
         let (mx, my) = (most.x as usize, most.y as usize);
-        let masks = self.masks_with(&[]);
-        let first = self.luminance_frame(frames[0], &masks);
+        let channels = self.most_telling(frames, frames);
+        let whole = self.luminance_frames(frames, channels);
+        let first = &whole[0];
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);
         let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(Vec::new()) };
@@ -225,9 +228,9 @@ impl Run<'_> {
             let s = shift(i, centre);
             ((x as f64 + s.x) as usize, (y as f64 + s.y) as usize)
         };
-        let cut: Vec<Frame> = frames.iter().map(|&i| self.luminance_frame(i, &masks).crop(at(i), (ww, wh))).collect();
+        let cut: Vec<Frame> = frames.iter().zip(&whole).map(|(&i, f)| f.crop(at(i), (ww, wh))).collect();
         let starts: Vec<Start> = self
-            .starts(frames)
+            .starts(frames, channels)
             .into_iter()
             .map(|s| {
                 let (x, y) = at(frames[s.reference]);
@@ -247,7 +250,7 @@ impl Run<'_> {
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
     fn patches(&mut self, used: &[usize], from: f32, to: f32) -> Result<Option<Found>> {
-        let frames = self.luminance_frames(used);
+        let frames = self.luminance_frames(used, self.most_telling(used, used));
         let times = |k: &usize| self.bracket.frames()[used[*k]].exposure_time;
         let shortest = (0..used.len()).min_by(|a, b| times(a).total_cmp(&times(b))).unwrap_or(0);
         let reference = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)).unwrap_or(shortest);
@@ -291,13 +294,14 @@ impl Run<'_> {
 
     /// The joint estimate.
     fn joint(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
-        let (frames, merged) = (self.luminance_frames(used), self.blurred_merge(used));
+        let channels = self.most_telling(used, used);
+        let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
-        let starts = self.starts(used);
+        let starts = self.starts(used, channels);
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
-        let found = blind::estimate(&frames, &starts, (&merged.mean(), &still), &mut |s| {
+        let found = blind::estimate(&frames, &starts, (&merged.mean_of(channels), &still), &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
@@ -312,6 +316,7 @@ impl Run<'_> {
             "reference": names[found.reference],
             "believed": believed,
             "in_doubt": doubtful,
+            "channels": channels.names(),
             "extent_px": extents,
             "estimated_at_scale": found.scale,
             "held_out_chi_squared": found.held_out,
@@ -333,7 +338,7 @@ impl Run<'_> {
         }
         let merged = self.blurred_merge(used);
         Ok(Some(Found {
-            start: Self::coloured(&merged, &found.luminance),
+            start: Self::coloured(&merged, &found.luminance, channels),
             tsfs: found.tsfs,
             reference: used[found.reference],
             reduced: found.scale > 1,
@@ -342,10 +347,7 @@ impl Run<'_> {
 
     /// Masks by which the frame `i` alone counts.
     fn own_masks(&self, i: usize) -> Vec<Plane> {
-        let frames = self.bracket.frames();
-        let mut alone = vec![false; frames.len()];
-        alone[i] = true;
-        mask::masks(frames, &alone, self.settings.alpha as f32, &self.motions)
+        self.masks_with(&[i], Channels::ALL)
     }
 
     /// Lessens the masks of the frames with less fine structure, for a merge of blurred frames, by the square of `detail` (0..=1 per frame): a long

@@ -7,7 +7,7 @@ use crate::colour::{self, Matrix};
 use crate::error::Error;
 use crate::exposure::Bracket;
 use crate::gpu::{Gate, Gpu, read};
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::io::input;
 use crate::kernels::{Channels, Place};
 use crate::layers;
@@ -558,7 +558,7 @@ fn overlay(kind: OverlayKind, i: usize, solved: &Solved) -> Option<Plane> {
     match kind {
         OverlayKind::Residual => solved.outcome.misfit.get(i)?.clone(),
         OverlayKind::FrameClipped => {
-            let clipped = mask::clipped(frames.get(i)?);
+            let clipped = mask::clipped(frames.get(i)?, Channels::ALL);
             Some(Plane { width, height, data: clipped.iter().map(|&c| f32::from(u8::from(c))).collect() })
         }
         OverlayKind::AllClipped => {
@@ -575,5 +575,5 @@ pub fn masks(solved: &Solved) -> Vec<Plane> {
     let frames = solved.bracket.frames();
     let sharp: Vec<bool> = (0..frames.len()).map(|i| report[i]["sharp"] == true).collect();
     let still = vec![glam::DMat3::IDENTITY; frames.len()];
-    mask::masks(frames, &sharp, solved.session.parameters.alpha as f32, &still)
+    mask::masks(frames, &sharp, solved.session.parameters.alpha as f32, &still, Channels::ALL)
 }

@@ -1,7 +1,7 @@
 //! What registration looks at: luminance irradiance with its noise, at several sizes, on a logarithmic scale.
 
 use crate::exposure::Frame;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::noise::NoiseModel;
 use crate::pose::project;
@@ -27,7 +27,7 @@ impl Picture {
     pub(super) fn of(frame: &Frame, exposure: &Rgb, noise: &NoiseModel) -> Self {
         let dt = frame.exposure_time;
         let mean = exposure.mean();
-        let clipped = mask::clipped(frame);
+        let clipped = mask::clipped(frame, Channels::ALL);
         let step = 1.0 / f64::from(frame.levels);
         // Three channels, and rounding: in the shadows of 8-bit files it is larger than the noise itself.
         let variance = |x: f64| (noise.variance(x) / 3.0 + (step * x.max(0.0).powf(0.55)).powi(2) / 36.0 + 1e-12) / (dt * dt);

@@ -3,8 +3,9 @@
 use crate::support::noise as numbers;
 use crate::support::texture;
 use glam::DMat3;
+use unshaken::channels;
 use unshaken::exposure::Frame;
-use unshaken::image::{Plane, Rgb};
+use unshaken::image::{Channels, Plane, Rgb};
 use unshaken::mask;
 use unshaken::noise;
 use unshaken::pose::{Pose, PoseGrid};
@@ -88,7 +89,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         exposure_time,
     };
     let one = |frames: &[Frame], sharp: &[bool]| {
-        mask::masks(frames, sharp, 0.3, &vec![DMat3::IDENTITY; frames.len()]).iter().map(|m| m.data[0]).collect::<Vec<f32>>()
+        mask::masks(frames, sharp, 0.3, &vec![DMat3::IDENTITY; frames.len()], Channels::ALL).iter().map(|m| m.data[0]).collect::<Vec<f32>>()
     };
     // A clipped red has a grey of 0.3, in the flat part of the window.
     assert_eq!(one(&[frame([1.0, 0.0, 0.0], 1.0)], &[true]), [0.0]);
@@ -104,8 +105,53 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         ..frame([0.0; 3], exposure_time)
     };
     let motions = [DMat3::IDENTITY, DMat3::from_translation(glam::DVec2::new(1.0, 0.0))];
-    let found = mask::masks(&[row([0.05; 3], 0.1), row([0.0, 0.4, 0.0], 1.0)], &[true, true], 0.3, &motions);
+    let found = mask::masks(&[row([0.05; 3], 0.1), row([0.0, 0.4, 0.0], 1.0)], &[true, true], 0.3, &motions, Channels::ALL);
     assert!(found[0].data[0] < 0.5 && found[0].data[1..] == [1.0, 1.0], "{found:?}");
+}
+
+#[test]
+fn pixels_apart_from_what_is_lost_are_those_beyond_the_radius() {
+    let (w, h) = (11, 7);
+    let lost: Vec<bool> = (0..w * h).map(|p| p == 2 * w + 3 || p == 6 * w + 10).collect();
+    for (p, apart) in mask::apart(&lost, (w, h), 2).into_iter().enumerate() {
+        let (x, y) = ((p % w) as isize, (p / w) as isize);
+        let far = |a: isize, b: isize| (x - a).abs().max((y - b).abs()) > 2;
+        assert_eq!(apart, far(3, 2) && far(10, 6), "at {x}, {y}");
+    }
+}
+
+#[test]
+fn a_blur_is_looked_for_in_the_channels_that_tell_of_it() {
+    let (w, h) = (120, 90);
+    let grain = numbers(3, w * h);
+    let level = noise::NoiseModel::from_electrons(4000.0, 8.0);
+    // Texture in the colour `tint`; lamps of ten times its light over a twelfth of the picture.
+    let bracket = |tint: [f32; 3], lamps: f32, times: [f64; 2]| -> Vec<Frame> {
+        let frame = |exposure_time: f64| {
+            let plane = |c: usize| {
+                Plane::from_fn(w, h, |x, y| {
+                    let lamp = if x % 30 < 10 && y % 30 < 8 { lamps } else { 1.0 };
+                    let e = tint[c] * lamp * (1.0 + 0.6 * grain[(y / 3) * w + x / 3]);
+                    (e * exposure_time as f32).min(1.0)
+                })
+            };
+            Frame { name: "tinted".into(), intensity: Rgb([0, 1, 2].map(plane)), levels: 65535, exposure_time }
+        };
+        times.map(frame).to_vec()
+    };
+    let chosen = |frames: &[Frame], blurred: &[usize], by: &[usize]| {
+        let exposures: Vec<Rgb> = frames.iter().map(|f| f.intensity.clone()).collect();
+        channels::most_telling(frames, &exposures, blurred, by, &level).names()
+    };
+    let warm = [0.4, 0.2, 0.04];
+    assert_eq!(chosen(&bracket(warm, 1.0, [0.5, 1.0]), &[0, 1], &[0, 1]), ["red", "green", "blue"], "nothing clips");
+    // The long frame has its red and green clipped nearly everywhere.
+    let long = bracket(warm, 1.0, [0.5, 8.0]);
+    assert_eq!(chosen(&long, &[1], &[0]), ["blue"], "where the long frame alone is blurred");
+    assert_eq!(chosen(&long, &[0], &[0, 1]), ["red", "green", "blue"], "the short one clips nothing");
+    // Lamps whose red no frame knows, and little is far from them; blue is known everywhere.
+    let lamps = bracket([0.3, 0.05, 0.05], 10.0, [1.0, 1.1]);
+    assert_eq!(chosen(&lamps, &[0, 1], &[0, 1]), ["green", "blue"], "lamps of unknown red");
 }
 
 #[test]
