@@ -30,6 +30,7 @@ pub mod io;
 pub mod kernels;
 pub mod layers;
 pub mod mask;
+mod maths;
 pub mod merge;
 pub mod metrics;
 pub mod noise;
@@ -39,6 +40,7 @@ pub mod pose;
 #[cfg(feature = "preview")]
 pub mod preview;
 pub mod psf;
+pub mod random;
 pub mod register;
 pub mod response;
 mod sampling;

@@ -5,6 +5,7 @@ use crate::image::Plane;
 use crate::mask;
 use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
+use crate::random::Random;
 use crate::tsf::{self, Tsf, WholeFrame};
 use glam::DMat3;
 use rayon::prelude::*;
@@ -64,6 +65,11 @@ const SEARCHED: usize = 20;
 const DEGREES: f64 = 2.0;
 /// Poses of a weight below this part of the largest are dropped.
 const FAINT: f64 = 0.02;
+/// Iterations for the scene that the TSFs are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
+/// iterations do not reach all of that, and a normal distribution does not hold it.
+const DRAWN: (usize, f32) = (15, 1.5);
+/// Seed of the draws.
+const SEED: u64 = 2013;
 /// One pixel of so many is held out.
 const HELD: usize = 29;
 
@@ -197,10 +203,17 @@ impl Level {
         state.latent = luminance::solve(&self.frames, &operators, &state.latent, &self.held, &effort);
     }
 
-    /// One round: luminance, then all TSFs, then the free warp.
-    fn round(&self, state: &mut State, smoothness: f32, model_error: f32) {
+    /// One round: luminance, then all TSFs, then the free warp. With `draws` the TSFs are fitted to one of the scenes that the data allow, not to the
+    /// smoothest, which is the best luminance: it is blurred, and TSFs that make up for that are too short, round by round.
+    fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>) {
         self.solve(state, smoothness, model_error, 2);
-        let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, &state.latent, Some(t), model_error));
+        let drawn = draws.map(|random| {
+            let operators = operators(&state.tsfs, self.size, self.pad);
+            let effort = Effort { lambda: LAMBDA * smoothness, outer: 1, inner: DRAWN.0, model_error };
+            luminance::drawn(&self.frames, &operators, &state.latent, &self.held, &effort, DRAWN.1, random)
+        });
+        let latent = drawn.as_ref().unwrap_or(&state.latent);
+        let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, latent, Some(t), model_error));
         let fits: Vec<Option<Tsf>> = fits.collect();
         for (tsf, fit) in state.tsfs.iter_mut().zip(fits) {
             if let Some(fit) = fit {
@@ -274,14 +287,15 @@ fn coarsest(frames: &[Frame]) -> usize {
 
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
 /// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
-/// `false`, which it is asked after each round.
-fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
+/// `false`, which it is asked after each round. `draws`: see [`Level::round`].
+fn at_coarsest(level: &Level, starts: &[Start], draws: bool, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best: Option<(f64, State)> = None;
     for start in starts {
         let mut state = level.begin(start);
+        let mut random = draws.then(|| Random::new(SEED, start.reference as u64));
         for k in 0..ROUNDS.0 {
             let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t));
+            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), random.as_mut());
             if !going() {
                 return None;
             }
@@ -300,7 +314,7 @@ pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnM
     let scale = coarsest(frames);
     let (mut done, total) = (0, ROUNDS.0 * starts.len());
     let level = Level::new(frames, scale, false);
-    let state = at_coarsest(&level, starts, &mut || {
+    let state = at_coarsest(&level, starts, false, &mut || {
         done += 1;
         progress(Stage { scale, fraction: done as f32 / total as f32 })
     })?;
@@ -330,14 +344,15 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     };
 
     let mut level = Level::new(frames, first, false);
-    let mut state = at_coarsest(&level, starts, &mut || advance(first))?;
+    let mut state = at_coarsest(&level, starts, true, &mut || advance(first))?;
+    let mut random = Random::new(SEED, u64::MAX);
     while level.scale > last {
         let finer = Level::new(frames, level.scale / 2, true);
         state = finer.refine(state, &level);
         level = finer;
         for k in 0..ROUNDS.1 {
             let t = k as f32 / (ROUNDS.1 - 1) as f32;
-            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t));
+            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
             if !advance(level.scale) {
                 return None;
             }

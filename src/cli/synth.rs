@@ -274,7 +274,7 @@ fn codes(frame: &Frame) -> image::DynamicImage {
 /// The frames' motions, displacement included.
 fn motions(args: &SynthArgs, numbers: &Numbers, width: usize, height: usize, focal_px: f64) -> crate::error::Result<Vec<Motion>> {
     let longest = numbers.times.iter().copied().fold(0.0, f64::max);
-    let mut displacement = synth::random::Random::new(args.seed, u64::MAX);
+    let mut displacement = crate::random::Random::new(args.seed, u64::MAX);
     let mut out = Vec::new();
     for (i, (&time, &shaken)) in numbers.times.iter().zip(&numbers.shaken).enumerate() {
         let motion = if shaken {

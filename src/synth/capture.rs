@@ -2,12 +2,12 @@
 //! quantisation.
 
 use super::motion::Motion;
-use super::random::Random;
 use super::scene::Scene;
 use super::shake::{Tremor, identity};
 use crate::error::Result;
 use crate::exposure::{Bracket, Frame};
 use crate::image::{Plane, Rgb};
+use crate::random::Random;
 use crate::response::Response;
 use crate::tsf::Tsf;
 use glam::{DMat3, DVec2, DVec3};

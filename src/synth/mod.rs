@@ -3,9 +3,7 @@
 pub mod capture;
 pub mod font;
 pub mod gyro;
-mod maths;
 pub mod motion;
-pub mod random;
 pub mod scene;
 pub mod shake;
 

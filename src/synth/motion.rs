@@ -1,10 +1,10 @@
 //! What the camera does during one exposure: tremor, a TSF on the paper's grid, a gyroscope's record, or motion in six degrees of freedom.
 
 use super::gyro::GyroRecord;
-use super::random::Random;
 use super::shake::{Tremor, Wander, identity};
 use crate::error::{Error, Result};
 use crate::pose::Pose;
+use crate::random::Random;
 use crate::tsf::Tsf;
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;

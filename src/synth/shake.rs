@@ -1,9 +1,9 @@
 //! Hand tremor: a smooth random camera path, continuous in time, off every grid of poses.
 
-use super::maths::Portable;
-use super::random::Random;
 use crate::error::Result;
+use crate::maths::Portable;
 use crate::pose::Pose;
+use crate::random::Random;
 use crate::tsf::Tsf;
 
 /// Number of sine waves of each degree of freedom.

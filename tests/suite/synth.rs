@@ -3,8 +3,8 @@
 use crate::support::files::shared;
 use unshaken::image::{Plane, Rgb};
 use unshaken::pose::Pose;
+use unshaken::random::Random;
 use unshaken::response::Response;
-use unshaken::synth::random::Random;
 use unshaken::synth::{self, Camera, Drawn, GyroRecord, Motion, Scene, Shake, Tremor, Wobble};
 use unshaken::tsf::Tsf;
 

@@ -2,8 +2,8 @@
 
 use super::Scene;
 use crate::image::{Plane, Rgb};
+use crate::maths::Portable;
 use crate::synth::font;
-use crate::synth::maths::Portable;
 
 pub(super) type Colour = [f32; 3];
 

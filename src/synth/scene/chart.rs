@@ -2,8 +2,8 @@
 
 use super::Scene;
 use super::canvas::{Canvas, EVERYWHERE, Ink, glow, grain, mix, paint, smooth, texture, times};
-use crate::synth::maths::Portable;
-use crate::synth::random::Random;
+use crate::maths::Portable;
+use crate::random::Random;
 
 const BULB: (f32, f32) = (96.0, 40.0);
 const LINES: [(&str, f32); 11] = [

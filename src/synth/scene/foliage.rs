@@ -2,8 +2,8 @@
 
 use super::Scene;
 use super::canvas::{Canvas, EVERYWHERE, Ink, glow, mix, paint, smooth, texture, times};
-use crate::synth::maths::Portable;
-use crate::synth::random::Random;
+use crate::maths::Portable;
+use crate::random::Random;
 
 const SUN: (f32, f32) = (150.0, 70.0);
 

@@ -2,8 +2,8 @@
 
 use super::Scene;
 use super::canvas::{Canvas, EVERYWHERE, Ink, glow, grain, mix, paint, smooth, texture, times};
-use crate::synth::maths::Portable;
-use crate::synth::random::Random;
+use crate::maths::Portable;
+use crate::random::Random;
 
 /// (x, y, strength, colour) of what lights the room.
 const LIGHTS: [(f32, f32, f32, [f32; 3]); 4] = [

@@ -2,9 +2,9 @@
 
 use super::Scene;
 use super::canvas::{Canvas, Colour, EVERYWHERE, Ink, glow, grain, mix, paint, smooth, texture, times};
+use crate::maths::Portable;
+use crate::random::Random;
 use crate::synth::font;
-use crate::synth::maths::Portable;
-use crate::synth::random::Random;
 
 /// The room, for frames of `width` x `height` pixels with `margin` pixels more on every side. Deterministic in `seed`.
 pub(super) fn room(width: usize, height: usize, margin: usize, oversampling: usize, seed: u64) -> Scene {

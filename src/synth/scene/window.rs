@@ -2,8 +2,8 @@
 
 use super::Scene;
 use super::canvas::{Canvas, EVERYWHERE, Ink, glow, grain, mix, paint, smooth, texture, times};
-use crate::synth::maths::Portable;
-use crate::synth::random::Random;
+use crate::maths::Portable;
+use crate::random::Random;
 
 /// Left, top, right, bottom of the opening.
 const OPENING: (f32, f32, f32, f32) = (40.0, 30.0, 246.0, 262.0);

@@ -1,6 +1,6 @@
 //! Seeded random numbers: uniform, normal, Poisson.
 
-use super::maths::Portable;
+use crate::maths::Portable;
 use rand::RngExt;
 use rand_pcg::Pcg64;
 
