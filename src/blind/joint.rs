@@ -65,7 +65,7 @@ const SEARCHED: usize = 20;
 const DEGREES: f64 = 2.0;
 /// Poses of a weight below this part of the largest are dropped.
 const FAINT: f64 = 0.02;
-/// Iterations for the scene that the TSFs are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
+/// Iterations for the scene that the TSFs of finer levels are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
 /// iterations do not reach all of that, and a normal distribution does not hold it.
 const DRAWN: (usize, f32) = (15, 1.5);
 /// Seed of the draws.
@@ -287,15 +287,14 @@ fn coarsest(frames: &[Frame]) -> usize {
 
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
 /// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
-/// `false`, which it is asked after each round. `draws`: see [`Level::round`].
-fn at_coarsest(level: &Level, starts: &[Start], draws: bool, going: &mut dyn FnMut() -> bool) -> Option<State> {
+/// `false`, which it is asked after each round.
+fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best: Option<(f64, State)> = None;
     for start in starts {
         let mut state = level.begin(start);
-        let mut random = draws.then(|| Random::new(SEED, start.reference as u64));
         for k in 0..ROUNDS.0 {
             let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), random.as_mut());
+            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None);
             if !going() {
                 return None;
             }
@@ -314,7 +313,7 @@ pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnM
     let scale = coarsest(frames);
     let (mut done, total) = (0, ROUNDS.0 * starts.len());
     let level = Level::new(frames, scale, false);
-    let state = at_coarsest(&level, starts, false, &mut || {
+    let state = at_coarsest(&level, starts, &mut || {
         done += 1;
         progress(Stage { scale, fraction: done as f32 / total as f32 })
     })?;
@@ -344,8 +343,8 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     };
 
     let mut level = Level::new(frames, first, false);
-    let mut state = at_coarsest(&level, starts, true, &mut || advance(first))?;
-    let mut random = Random::new(SEED, u64::MAX);
+    let mut state = at_coarsest(&level, starts, &mut || advance(first))?;
+    let mut random = Random::new(SEED, 0);
     while level.scale > last {
         let finer = Level::new(frames, level.scale / 2, true);
         state = finer.refine(state, &level);
