@@ -1,6 +1,7 @@
 //! The joint estimate: luminance and TSFs in turn, from coarse to fine.
 
 use super::luminance::{self, Effort, Frame, chi_squared, operators};
+use super::operator::Operator;
 use crate::image::Plane;
 use crate::mask;
 use crate::merge::gradient_level;
@@ -65,8 +66,8 @@ const SEARCHED: usize = 20;
 const DEGREES: f64 = 2.0;
 /// Poses of a weight below this part of the largest are dropped.
 const FAINT: f64 = 0.02;
-/// Iterations for the scene that the TSFs of finer levels are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
-/// iterations do not reach all of that, and a normal distribution does not hold it.
+/// Iterations for the scene that the TSFs of finer levels are fitted to, drawn around the best one, and its deviation in units of what the
+/// data leave open: so few iterations do not reach all of that, and a normal distribution does not hold it.
 const DRAWN: (usize, f32) = (15, 1.5);
 /// Seed of the draws.
 const SEED: u64 = 2013;
@@ -197,18 +198,19 @@ impl Level {
         state
     }
 
-    fn solve(&self, state: &mut State, smoothness: f32, model_error: f32, outer: usize) {
+    /// Luminance under the TSFs, whose operators are returned.
+    fn solve(&self, state: &mut State, smoothness: f32, model_error: f32, outer: usize) -> Vec<Operator> {
         let operators = operators(&state.tsfs, self.size, self.pad);
         let effort = Effort { lambda: LAMBDA * smoothness, outer, inner: 12, model_error };
         state.latent = luminance::solve(&self.frames, &operators, &state.latent, &self.held, &effort);
+        operators
     }
 
     /// One round: luminance, then all TSFs, then the free warp. With `draws` the TSFs are fitted to one of the scenes that the data allow, not to the
     /// smoothest, which is the best luminance: it is blurred, and TSFs that make up for that are too short, round by round.
     fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>) {
-        self.solve(state, smoothness, model_error, 2);
+        let operators = self.solve(state, smoothness, model_error, 2);
         let drawn = draws.map(|random| {
-            let operators = operators(&state.tsfs, self.size, self.pad);
             let effort = Effort { lambda: LAMBDA * smoothness, outer: 1, inner: DRAWN.0, model_error };
             luminance::drawn(&self.frames, &operators, &state.latent, &self.held, &effort, DRAWN.1, random)
         });

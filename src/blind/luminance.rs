@@ -299,8 +299,8 @@ pub fn operators(tsfs: &[Tsf], size: (usize, usize), pad: usize) -> Vec<Operator
 
 impl Frame {
     /// Luminance of one frame, the mean of `channels`, from its exposure (1 = white), their mask, noise curves per channel
-    /// ([`crate::kernels::NOISE_STEPS`] values) and exposure time in seconds. The variance is that of the locally smoothed exposure: a pixel's own value would give more weight to
-    /// what noise made darker.
+    /// ([`crate::kernels::NOISE_STEPS`] values) and exposure time in seconds. The variance is that of the locally smoothed exposure: a
+    /// pixel's own value would give more weight to what noise made darker.
     pub fn new(exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>; 3], exposure_time: f64, channels: Channels) -> Self {
         let count = channels.count() as f32;
         let dt = exposure_time as f32;

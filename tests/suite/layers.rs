@@ -12,6 +12,8 @@ const TABLE: &[(&str, &[&str])] = &[
     ("exposure", &["error", "image"]),
     // Mathematics without images.
     ("fft", &[]),
+    ("maths", &[]),
+    ("random", &["maths"]),
     ("nonnegative", &[]),
     ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
@@ -20,11 +22,12 @@ const TABLE: &[(&str, &[&str])] = &[
     ("mask", &["error", "image", "exposure", "pose"]),
     ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
+    ("channels", &["image", "exposure", "mask", "merge", "noise"]),
     ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft"]),
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative", "sampling"]),
-    ("blind", &["image", "merge", "pose", "psf", "sampling", "tsf"]),
+    ("blind", &["image", "mask", "merge", "pose", "psf", "random", "sampling", "tsf"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
@@ -40,6 +43,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "exposure",
             "response",
             "noise",
+            "channels",
             "mask",
             "merge",
             "register",
@@ -53,7 +57,7 @@ const TABLE: &[(&str, &[&str])] = &[
         ],
     ),
     // Brackets with known truth: never an estimator.
-    ("synth", &["error", "image", "pose", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
+    ("synth", &["error", "image", "maths", "pose", "random", "exposure", "response", "tsf::Tsf", "tsf::TsfEntry", "tsf::TsfFile"]),
     // Colours.
     ("colour", &["image"]),
     // What a result rests on.
@@ -74,6 +78,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "metrics",
             "tonemap",
             "synth",
+            "random",
             "pipeline",
             "noise",
             "mask",
@@ -104,6 +109,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "metrics",
             "tonemap",
             "synth",
+            "random",
             "preview",
             "gpu::list_adapters",
             "tsf::Interpolation",
