@@ -17,67 +17,51 @@ const NOISE_GRADIENT: f64 = std::f64::consts::PI;
 const SEEN: f64 = 0.02;
 /// Information per frame, in parts of that of all three channels, that a choice of fewer has to bring: fewer are noisier, and less like the luminance.
 const GAIN: f64 = 1.15;
-/// Distance in pixels from what no frame knows up to which its light is counted with.
-const UNKNOWN: usize = 10;
 
-/// A bracket in the channels that are looked at.
-struct Look<'a> {
-    frames: &'a [Frame],
-    channels: Channels,
-    /// Where each frame is clipped.
-    clipped: Vec<Vec<bool>>,
+/// Pixels apart from those that all of `frames`, as they lie, clip in `channels`.
+fn known<'a>(frames: impl Iterator<Item = &'a Frame>, size: (usize, usize), channels: Channels) -> Vec<bool> {
+    let mut lost = vec![true; size.0 * size.1];
+    for frame in frames {
+        lost.iter_mut().zip(mask::clipped(frame, channels)).for_each(|(l, c)| *l &= c);
+    }
+    mask::apart(&lost, size, mask::UNKNOWN)
 }
 
-impl<'a> Look<'a> {
-    fn new(frames: &'a [Frame], channels: Channels) -> Self {
-        Self { frames, channels, clipped: frames.iter().map(|f| mask::clipped(f, channels)).collect() }
-    }
-
-    /// Pixels that the frames `ids` record, added up.
-    fn recorded(&self, ids: &[usize]) -> usize {
-        ids.iter().flat_map(|&i| &self.clipped[i]).filter(|c| !**c).count()
-    }
-
-    /// Pixels apart from those that the frames `by` all clip, as they lie.
-    fn known(&self, by: &[usize]) -> Vec<bool> {
-        let size = self.frames[0].intensity.size();
-        let lost: Vec<bool> = (0..size.0 * size.1).map(|p| by.iter().all(|&k| self.clipped[k][p])).collect();
-        mask::apart(&lost, size, UNKNOWN)
-    }
-
-    /// What the mean of the channels of the frame `i` (`exposure`: 1 = white) tells about its blur: the sum over the pixels `known` that it does
-    /// not clip of squared gradients in units of the noise, as far as they count.
-    fn information(&self, i: usize, exposure: &Rgb, noise: &NoiseModel, known: &[bool]) -> f64 {
-        let mean = exposure.mean_of(self.channels);
-        let structure = gradient_level(&mean, AROUND);
-        let one = |p: usize| {
-            let variance = noise.variance(f64::from(mean.data[p])) / self.channels.count() as f64;
-            let signal = (f64::from(structure.data[p]).powi(2) - NOISE_GRADIENT * variance).max(0.0);
-            signal / (variance + MODEL_ERROR.powi(2) * signal)
-        };
-        (0..known.len()).filter(|&p| known[p] && !self.clipped[i][p]).map(one).sum()
-    }
+/// What the mean of `channels` of an exposure (1 = white) tells about its blur: the sum over the pixels `seen` of squared gradients in units of the
+/// noise, as far as they count.
+fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: impl Fn(usize) -> bool) -> f64 {
+    let mean = exposure.mean_of(channels);
+    let structure = gradient_level(&mean, AROUND);
+    let one = |p: usize| {
+        let variance = noise.variance(f64::from(mean.data[p])) / channels.count() as f64;
+        let signal = (f64::from(structure.data[p]).powi(2) - NOISE_GRADIENT * variance).max(0.0);
+        signal / (variance + MODEL_ERROR.powi(2) * signal)
+    };
+    (0..mean.data.len()).filter(|&p| seen(p)).map(one).sum()
 }
 
 /// The channels whose mean tells most about the blurs of the frames `blurred` (no frame's is bought with another's), the scene being known from
 /// the frames `by`: indices into `frames`, whose exposures (1 = white) are `exposures`. All three channels where they clip together.
 pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: &[usize], noise: &NoiseModel) -> Channels {
-    let all = Look::new(frames, Channels::ALL);
-    let pixels: usize = blurred.iter().map(|&i| all.clipped[i].len()).sum();
-    let least = all.recorded(blurred) + (SEEN * pixels as f64) as usize;
-    let others: Vec<Look> = Channels::choices().skip(1).map(|c| Look::new(frames, c)).filter(|l| l.recorded(blurred) > least).collect();
+    let clipped = |c: Channels| -> Vec<Vec<bool>> { blurred.iter().map(|&i| mask::clipped(&frames[i], c)).collect() };
+    let recorded = |clipped: &[Vec<bool>]| clipped.iter().flatten().filter(|c| !**c).count();
+    let all = clipped(Channels::ALL);
+    let pixels: usize = all.iter().map(Vec::len).sum();
+    let least = recorded(&all) + (SEEN * pixels as f64) as usize;
+    let others: Vec<_> = Channels::choices().skip(1).map(|c| (c, clipped(c))).filter(|o| recorded(&o.1) > least).collect();
     if others.is_empty() {
         return Channels::ALL;
     }
-    let told = |look: &Look| {
-        let known = look.known(by);
-        blurred.iter().map(|&i| (1.0 + look.information(i, &exposures[i], noise, &known)).ln()).sum::<f64>()
+    let told = |channels: Channels, clipped: &[Vec<bool>]| {
+        let known = known(by.iter().map(|&k| &frames[k]), frames[0].intensity.size(), channels);
+        let of = |(&i, clipped): (&usize, &Vec<bool>)| information(&exposures[i], channels, noise, |p| known[p] && !clipped[p]);
+        blurred.iter().zip(clipped).map(|b| (1.0 + of(b)).ln()).sum::<f64>()
     };
-    let mut best = (told(&all) + blurred.len() as f64 * GAIN.ln(), Channels::ALL);
-    for look in &others {
-        let value = told(look);
+    let mut best = (told(Channels::ALL, &all) + blurred.len() as f64 * GAIN.ln(), Channels::ALL);
+    for (channels, clipped) in &others {
+        let value = told(*channels, clipped);
         if value > best.0 {
-            best = (value, look.channels);
+            best = (value, *channels);
         }
     }
     best.1

@@ -36,6 +36,9 @@ pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
     (0..planes[0].data.len()).map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
 }
 
+/// Distance in pixels from what no frame knows up to which its light, blurred, is counted with.
+pub const UNKNOWN: usize = 10;
+
 /// Pixels of a frame of `size` farther than `radius`, along rows and columns, from those where `lost` is true.
 pub fn apart(lost: &[bool], size: (usize, usize), radius: usize) -> Vec<bool> {
     let (w, h) = size;

@@ -181,7 +181,7 @@ impl Level {
         let size = frames[0].blurred.size();
         let radius = (longer / SEARCHED).max(8).div_ceil(scale) + 1;
         let grid = PoseGrid::new(size.0, size.1, radius, DEGREES, 1.0);
-        let known = known(&frames, 10 / scale + 1);
+        let known = known(&frames, mask::UNKNOWN / scale + 1);
         // A fixed scatter over rows and columns.
         let held = (0..size.0 * size.1).map(|p| (p % size.0 * 12 + p / size.0 * 5).is_multiple_of(HELD)).collect();
         Self { scale, pad: radius + 6, frames, size, grid, near, known, held }

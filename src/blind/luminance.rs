@@ -72,9 +72,9 @@ struct System<'a> {
     data: &'a Data<'a>,
     e: Vec<f32>,
     weights: Vec<Vec<f32>>,
+    /// Of each frame: the observation less what the luminance predicts.
+    residuals: Vec<Vec<f32>>,
     edge: Vec<f32>,
-    /// Negative gradient.
-    right: Vec<f32>,
     preconditioner: Vec<f32>,
 }
 
@@ -110,19 +110,17 @@ impl<'a> Data<'a> {
         let (w, h) = self.size;
         let n = w * h;
         let e: Vec<f32> = u.iter().map(|v| v.exp()).collect();
-        let mut weights: Vec<Vec<f32>> = Vec::new();
-        let mut right = vec![0.0f32; n];
+        let (mut weights, mut residuals) = (Vec::new(), Vec::new());
         let mut diagonal = vec![0.0f32; n];
         for (k, (frame, operator)) in self.frames.iter().zip(self.operators).enumerate() {
             let predicted = operator.forward(&e);
             let residual: Vec<f32> = frame.blurred.data.iter().zip(&predicted).map(|(b, p)| b - p).collect();
             let weight = self.weights(k, &residual);
-            let back = operator.adjoint(&residual.iter().zip(&weight).map(|(r, w)| r * w).collect::<Vec<f32>>());
-            right.iter_mut().zip(&back).for_each(|(a, b)| *a += b);
             let spread = operator.adjoint(&weight);
             // Cubic weights have negative lobes; a preconditioner may not.
             diagonal.iter_mut().zip(&spread).for_each(|(a, b)| *a += operator.energy() * b.max(0.0));
             weights.push(weight);
+            residuals.push(residual);
         }
         let edge: Vec<f32> = (0..n)
             .map(|p| {
@@ -141,13 +139,7 @@ impl<'a> Data<'a> {
                 1.0 / d.max(1e-20)
             })
             .collect();
-        let mut system = System { data: self, e, weights, edge, right, preconditioner };
-        let mut smoothness = vec![0.0f32; n];
-        system.differences(u, &mut smoothness, |e, d| e * d);
-        for (r, (e, s)) in system.right.iter_mut().zip(system.e.iter().zip(&smoothness)) {
-            *r = e * *r - s;
-        }
-        system
+        System { data: self, e, weights, residuals, edge, preconditioner }
     }
 }
 
@@ -170,6 +162,19 @@ impl System<'_> {
                 }
             }
         }
+    }
+
+    /// The negative gradient at the log luminance `u` that the system was made at.
+    fn descent(&self, u: &[f32]) -> Vec<f32> {
+        let mut right = vec![0.0f32; u.len()];
+        for (operator, (residual, weight)) in self.data.operators.iter().zip(self.residuals.iter().zip(&self.weights)) {
+            let back = operator.adjoint(&residual.iter().zip(weight).map(|(r, w)| r * w).collect::<Vec<f32>>());
+            right.iter_mut().zip(&back).for_each(|(a, b)| *a += b);
+        }
+        let mut smoothness = vec![0.0f32; u.len()];
+        self.differences(u, &mut smoothness, |w, d| w * d);
+        right.iter_mut().zip(self.e.iter().zip(&smoothness)).for_each(|(r, (e, s))| *r = e * *r - s);
+        right
     }
 
     fn product(&self, v: &[f32]) -> Vec<f32> {
@@ -235,9 +240,8 @@ pub fn solve(frames: &[Frame], operators: &[Operator], latent: &Plane, held: &[b
     let data = Data::new(frames, operators, held, (width, height), effort);
     let mut u = logarithm(latent);
     for _ in 0..effort.outer {
-        let mut system = data.system(&u);
-        let right = std::mem::take(&mut system.right);
-        let step = system.step(right, effort.inner);
+        let system = data.system(&u);
+        let step = system.step(system.descent(&u), effort.inner);
         // The data term is quadratic in E: upwards the step is E (1 + δu), at most fourfold.
         u.iter_mut().zip(&step).for_each(|(u, s)| *u += if *s > 0.0 { s.min(3.0).ln_1p() } else { s.max(-1.0) });
     }
