@@ -9,7 +9,7 @@ use std::time::Instant;
 use unshaken::deblur::{self, Observation, Settings};
 use unshaken::gpu::{Gpu, Step, read};
 use unshaken::image::{Plane, Rgb};
-use unshaken::kernels::{Blur, Channels, Kernels, NOISE_STEPS, Scratch, channels};
+use unshaken::kernels::{Blur, DeviceRgb, Kernels, NOISE_STEPS, Scratch, channels};
 use unshaken::pose::Pose;
 use unshaken::tsf::{Interpolation, Tap, TapSet, Tsf};
 
@@ -40,8 +40,8 @@ fn workload() -> TapSet {
 
 struct Device {
     gpu: Gpu,
-    frame: Channels,
-    back: Channels,
+    frame: DeviceRgb,
+    back: DeviceRgb,
     forward: Vec<Step>,
     adjoint: Vec<Step>,
 }

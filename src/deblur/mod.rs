@@ -28,7 +28,7 @@ use crate::error::{Error, Result};
 use crate::gpu::{self, Gpu, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::{
-    Blur, Channels, HALO, Kernels, Misfit, MisfitSource, REACH, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS,
+    Blur, DeviceRgb, HALO, Kernels, Misfit, MisfitSource, REACH, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS,
     STILL, Scratch, ScratchSize, WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
@@ -206,8 +206,8 @@ struct Operator {
 
 struct Moving {
     operator: Operator,
-    weight: Channels,
-    observation: Channels,
+    weight: DeviceRgb,
+    observation: DeviceRgb,
 }
 
 impl Moving {
@@ -247,7 +247,7 @@ impl Moving {
 /// Exposure and mask of a frame.
 enum Kept {
     /// In buffers of their own.
-    Device { exposure: Channels, mask: wgpu::Buffer },
+    Device { exposure: DeviceRgb, mask: wgpu::Buffer },
     /// On the host, to fill buffers that are shared before they are read: red, green, blue, mask.
     Host([Arc<Vec<f32>>; 4]),
 }
@@ -258,12 +258,12 @@ struct Observed {
 }
 
 struct State {
-    irradiance: Channels,
+    irradiance: DeviceRgb,
     /// Before the step that is tried.
-    old: Channels,
-    solution: Channels,
-    weight: Channels,
-    observation: Channels,
+    old: DeviceRgb,
+    solution: DeviceRgb,
+    weight: DeviceRgb,
+    observation: DeviceRgb,
     edge: wgpu::Buffer,
     /// Of the channels that are solved together: one, or three.
     residual: Vec<wgpu::Buffer>,
@@ -293,7 +293,7 @@ struct Solver<'a> {
     memory: Memory,
 }
 
-fn upload_rgb(gpu: &Gpu, label: &str, image: &Rgb) -> Result<Channels> {
+fn upload_rgb(gpu: &Gpu, label: &str, image: &Rgb) -> Result<DeviceRgb> {
     let [r, g, b] = &image.0;
     Ok([gpu.upload(label, &r.data)?, gpu.upload(label, &g.data)?, gpu.upload(label, &b.data)?])
 }
@@ -407,7 +407,7 @@ pub fn solve_watched(
     initial: &Rgb,
     pad: usize,
     settings: &Settings,
-    watch: &mut dyn FnMut(&Channels),
+    watch: &mut dyn FnMut(&DeviceRgb),
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Solution> {
     let (mut limit, mut reduced) = (settings.memory_limit.unwrap_or(u64::MAX), false);

@@ -5,7 +5,7 @@ use crate::collaborative::{self, Patch, Precision, SIDE, VALUES};
 use crate::error::{Error, Result};
 use crate::gpu::{self, Step};
 use crate::image::{Plane, Rgb};
-use crate::kernels::Channels;
+use crate::kernels::DeviceRgb;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::Arc;
@@ -107,7 +107,7 @@ impl Solver<'_> {
         Plane::from_vec(self.latent.0, self.latent.1, gpu::read(self.gpu, plane, self.latent.0 * self.latent.1)?)
     }
 
-    pub(super) fn read(&self, planes: &Channels) -> Result<Rgb> {
+    pub(super) fn read(&self, planes: &DeviceRgb) -> Result<Rgb> {
         Ok(Rgb([self.read_plane(&planes[0])?, self.read_plane(&planes[1])?, self.read_plane(&planes[2])?]))
     }
 

@@ -1,6 +1,6 @@
 //! Irradiance from the solver's planes to a render target: `picture.wgsl`, `shrink.wgsl`, `display.wgsl`.
 
-use super::Channels;
+use super::DeviceRgb;
 use std::collections::HashMap;
 use std::ops::Range;
 use wgpu::util::DeviceExt;
@@ -268,7 +268,7 @@ impl Display {
         &self,
         device: &wgpu::Device,
         encoder: &mut wgpu::CommandEncoder,
-        planes: &Channels,
+        planes: &DeviceRgb,
         place: &Place,
         matrix: &[[f32; 4]; 3],
         room: &wgpu::Texture,

@@ -265,7 +265,7 @@ impl LinearKernels {
     pub fn edge_weight(
         &self,
         gpu: &Gpu,
-        irradiance: &super::Channels,
+        irradiance: &super::DeviceRgb,
         edge: &wgpu::Buffer,
         partials: &wgpu::Buffer,
         lambda: f32,

@@ -19,13 +19,13 @@ use crate::gpu::Gpu;
 use crate::tsf::Interpolation;
 
 /// Three buffers of one size: red, green, blue.
-pub type Channels = [wgpu::Buffer; 3];
+pub type DeviceRgb = [wgpu::Buffer; 3];
 
 /// Three planes of `count` zeros.
 ///
 /// # Errors
 /// As [`Gpu::plane`].
-pub fn channels(gpu: &Gpu, label: &str, count: usize) -> crate::error::Result<Channels> {
+pub fn channels(gpu: &Gpu, label: &str, count: usize) -> crate::error::Result<DeviceRgb> {
     Ok([gpu.plane(label, count)?, gpu.plane(label, count)?, gpu.plane(label, count)?])
 }
 

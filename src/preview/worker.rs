@@ -9,7 +9,7 @@ use crate::exposure::Bracket;
 use crate::gpu::{Gate, Gpu, read};
 use crate::image::{Channels, Plane, Rgb};
 use crate::io::input;
-use crate::kernels::{Channels, Place};
+use crate::kernels::{DeviceRgb, Place};
 use crate::layers;
 use crate::mask;
 use crate::noise;
@@ -38,7 +38,7 @@ pub const BINS_PER_STOP: usize = 4;
 #[derive(Clone, PartialEq)]
 pub struct Picture {
     /// The planes.
-    pub planes: Channels,
+    pub planes: DeviceRgb,
     /// Where in them.
     pub place: Place,
     /// Differs when what the planes hold does.

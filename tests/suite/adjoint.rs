@@ -4,7 +4,7 @@ use crate::oracle::blur::{self, Matrix};
 use crate::support::gpu::{POISON, buffer, gpu, kernels, planes, poisoned, read, run};
 use crate::support::{assert_close, f64s, noise};
 use glam::{DMat3, DVec2};
-use unshaken::kernels::{Blur, Channels, Scratch, ScratchSize};
+use unshaken::kernels::{Blur, DeviceRgb, Scratch, ScratchSize};
 use unshaken::pose::Pose;
 use unshaken::tsf::{INDISTINGUISHABLE, Interpolation, TapSet, Tsf};
 
@@ -12,7 +12,7 @@ const ALL: [Interpolation; 3] = [Interpolation::Bilinear, Interpolation::Bicubic
 const SIZES: [(usize, usize); 7] = [(1, 1), (1, 7), (7, 1), (17, 9), (33, 65), (67, 31), (300, 5)];
 
 /// Inputs with more behind their end: what a missing check of the border would read.
-fn with_more(values: &[Vec<f32>; 3]) -> Channels {
+fn with_more(values: &[Vec<f32>; 3]) -> DeviceRgb {
     planes(&values.each_ref().map(|v| [v.as_slice(), &[POISON; 400]].concat()))
 }
 
@@ -104,7 +104,7 @@ impl Case {
         }
     }
 
-    fn forward(&self, scratch: &Scratch, latent: &Channels) -> [Vec<f32>; 3] {
+    fn forward(&self, scratch: &Scratch, latent: &DeviceRgb) -> [Vec<f32>; 3] {
         let m = self.counts().1;
         let out = [poisoned(m), poisoned(m), poisoned(m)];
         let kernels = kernels().blur(self.interpolation);
@@ -115,7 +115,7 @@ impl Case {
     }
 
     /// `start + factor Kᵀ frame`.
-    fn adjoint(&self, scratch: &Scratch, frame: &Channels, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
+    fn adjoint(&self, scratch: &Scratch, frame: &DeviceRgb, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
         let out = planes(start);
         let kernels = kernels().blur(self.interpolation);
         for (frame, out) in frame.chunks(scratch.channels()).zip(out.chunks(scratch.channels())) {
@@ -461,7 +461,7 @@ fn planes_larger_than_a_binding_are_bound_in_bands() {
         let blur = Blur::new(&gpu, kernels.blur(Interpolation::Bilinear), &taps, frame, pad);
         let most = ScratchSize { planes: gpu.max_binding(), copy: gpu.max_binding() };
         let scratch = Scratch::new(&gpu, blur.scratch_wanted().min(most), 3).expect("fits");
-        let upload = |seed: u64, count: usize| -> ([Vec<f32>; 3], Channels) {
+        let upload = |seed: u64, count: usize| -> ([Vec<f32>; 3], DeviceRgb) {
             let values = [noise(seed, count), noise(seed + 1, count), noise(seed + 2, count)];
             let buffers = values.each_ref().map(|v| gpu.upload("test", v).expect("fits"));
             (values, buffers)

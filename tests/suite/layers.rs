@@ -137,7 +137,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "pipeline",
             "tonemap",
             "gpu",
-            "kernels::Channels",
+            "kernels::DeviceRgb",
             "kernels::Display",
             "kernels::DisplayParams",
             "kernels::Part",

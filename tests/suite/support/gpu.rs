@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 use unshaken::gpu::{self, Gpu, Step};
-use unshaken::kernels::{Channels, Kernels};
+use unshaken::kernels::{DeviceRgb, Kernels};
 
 /// What every output buffer holds before a kernel that overwrites it.
 pub const POISON: f32 = -12345.0;
@@ -25,7 +25,7 @@ pub fn buffer(values: &[f32]) -> wgpu::Buffer {
 }
 
 /// Three buffers.
-pub fn planes(values: &[Vec<f32>; 3]) -> Channels {
+pub fn planes(values: &[Vec<f32>; 3]) -> DeviceRgb {
     values.each_ref().map(|v| buffer(v))
 }
 
