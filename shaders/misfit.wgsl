@@ -1,5 +1,5 @@
-// Squared residual over variance, mean of the three channels, and how many pixels it stands for, of one frame: the first
-// step of the residual-driven weights. One channel at a time adds its third.
+// A third of the squared residual over variance of each channel that a pixel shows, and how many thirds of a pixel that is,
+// of one frame: the first step of the residual-driven weights. One channel at a time adds its own.
 struct Params {
     size: vec2i,             // of the frame
     rows: vec2i,             // of the frame: the first to compute, and the one after the last
@@ -15,7 +15,7 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> predicted: array<f32>;  // K E, irradiance
-@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white
+@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white, or unseen
 @group(0) @binding(3) var<storage, read> mask: array<f32>;
 @group(0) @binding(4) var<storage, read_write> misfit: array<f32>;
 @group(0) @binding(5) var<storage, read_write> counted: array<f32>;
@@ -35,8 +35,8 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         m = clipped_at_black(expected, s);
     }
     let r = exposure[i] - m.mean;
-    let before = select(0.0, misfit[i], params.accumulate == 1u);
-    let counts = mask[i] > 0.0;
-    misfit[i] = select(0.0, before + r * r / m.variance / 3.0, counts);
-    counted[i] = select(0.0, 1.0, counts);
+    let keep = params.accumulate == 1u;
+    let counts = mask[i] > 0.0 && !unseen(exposure[i]);
+    misfit[i] = select(0.0, misfit[i], keep) + select(0.0, r * r / m.variance / 3.0, counts);
+    counted[i] = select(0.0, counted[i], keep) + select(0.0, 1.0 / 3.0, counts);
 }

@@ -23,7 +23,7 @@ struct Params {
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> predicted: array<f32>;  // K E, irradiance
-@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white
+@group(0) @binding(2) var<storage, read> exposure: array<f32>;   // f^-1(Z), 1 = white, or unseen
 @group(0) @binding(3) var<storage, read> mask: array<f32>;
 @group(0) @binding(4) var<storage, read> misfit: array<f32>;     // local sum of chi^2
 @group(0) @binding(5) var<storage, read> counted: array<f32>;    // and of pixels
@@ -46,7 +46,8 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     }
     let excess = max(misfit[i] / max(counted[i], 1e-6) - 1.0, 0.0);
     let gain = params.exposure_time * m.slope;
-    let w = mask[i] * mask[i] * gain * gain / (m.variance * (1.0 + params.robust * excess));
+    let counts = select(mask[i], 0.0, unseen(exposure[i]));
+    let w = counts * counts * gain * gain / (m.variance * (1.0 + params.robust * excess));
     let b = w * (irradiance + (exposure[i] - m.mean) / gain);
     let o = at(p + params.out_offset - vec2i(0, params.out_first), params.out_stride);
     let keep = params.accumulate == 1u;

@@ -36,6 +36,18 @@ pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
     (0..planes[0].data.len()).map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
 }
 
+/// `mask`, which is 0 where any channel of `frame` is clipped, for those who take each channel by itself: where some are clipped and others are
+/// not, the window's high end at the grey of them all, times `share`. The colour of a lamp or of the sky is clipped in one channel long before it is
+/// in the others, which no other frame may show as well.
+pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: f32) -> Plane {
+    let (grey, planes) = (grey(frame, Channels::ALL), &frame.intensity.0);
+    let one = |p: usize| match planes.iter().filter(|c| c.data[p] >= CLIPPED).count() {
+        1 | 2 => share * low_taper(1.0 - grey.data[p], alpha),
+        _ => mask.data[p],
+    };
+    Plane { data: (0..mask.data.len()).map(one).collect(), ..grey }
+}
+
 /// Distance in pixels from what no frame knows up to which its light, blurred, is counted with.
 pub const UNKNOWN: usize = 10;
 

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::exposure::Bracket;
 use crate::gpu::Gpu;
 use crate::image::{Channels, Plane, Rgb};
-use crate::kernels::Kernels;
+use crate::kernels::{Kernels, UNSEEN};
 use crate::mask;
 use crate::merge;
 use crate::noise::{self, NoiseModel};
@@ -195,6 +195,8 @@ struct Run<'a> {
     settings: &'a Settings,
     exposures: Vec<Rgb>,
     masks: Vec<Plane>,
+    /// What each frame's mask has been lessened to.
+    shares: Vec<f32>,
     /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
     looks: Vec<(Channels, Option<Plane>)>,
     noise: NoiseModel,
@@ -265,6 +267,7 @@ pub fn merge_with(
         settings,
         exposures,
         masks: Vec::new(),
+        shares: vec![1.0; frames.len()],
         looks: Vec::new(),
         noise,
         curves,
@@ -693,19 +696,9 @@ impl Run<'_> {
         from: f32,
         to: f32,
     ) -> Result<Solution> {
-        let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
-        let observations: Vec<Observation> = ids
-            .iter()
-            .map(|&i| Observation {
-                exposure: self.exposures[i].clone(),
-                mask: self.masks[i].clone(),
-                exposure_time: frames[i].exposure_time,
-                noise: self.curves[i].clone(),
-                black_clipped: true,
-                tsf: tsfs[i].clone().unwrap_or_else(Tsf::identity),
-            })
-            .collect();
+        let observations: Vec<Observation> =
+            ids.iter().map(|&i| self.observation(i, tsfs[i].clone().unwrap_or_else(Tsf::identity))).collect();
         let moving = observations.iter().any(|o| !o.tsf.is_identity());
         let stage = if moving { "deblurring" } else { "merging the sharp frames" };
         let events = std::cell::RefCell::new(&mut self.events);
@@ -719,6 +712,21 @@ impl Run<'_> {
             self.warn("the GPU's memory is short: the work is done in smaller pieces, which takes longer".into())?;
         }
         Ok(solved)
+    }
+
+    /// Frame `i`, every channel that is not clipped by itself.
+    fn observation(&self, i: usize, tsf: Tsf) -> Observation {
+        let frame = &self.bracket.frames()[i];
+        let unclipped = |x: f32, z: f32| if z < mask::CLIPPED { x } else { UNSEEN };
+        let exposure = std::array::from_fn(|c| self.exposures[i].0[c].zip(&frame.intensity.0[c], unclipped));
+        Observation {
+            exposure: Rgb(exposure),
+            mask: mask::with_partly_clipped(&self.masks[i], frame, self.settings.alpha as f32, self.shares[i]),
+            exposure_time: frame.exposure_time,
+            noise: self.curves[i].clone(),
+            black_clipped: true,
+            tsf,
+        }
     }
 
     /// Exposures and masks of the frames `ids` as registration places them, on the reference's grid plus `pad` pixels on every side; of

@@ -41,3 +41,8 @@ fn clipped_at_black(exposure: f32, s: f32) -> Moments {
     let second = (exposure * exposure + s * s) * cdf + exposure * s * pdf;
     return Moments(mean, cdf, max(second - mean * mean, 0.05 * s * s));
 }
+
+// Whether a channel was clipped at a pixel and says nothing there: its exposure is marked by a value that none can have.
+fn unseen(exposure: f32) -> bool {
+    return exposure < -0.5;
+}

@@ -39,9 +39,9 @@ use std::sync::Arc;
 
 /// One frame as the solver sees it.
 pub struct Observation {
-    /// Exposure f⁻¹(Z), 1 = white, three channels.
+    /// Exposure f⁻¹(Z), 1 = white, three channels; [`crate::kernels::UNSEEN`] where a channel is clipped and others are not.
     pub exposure: Rgb,
-    /// Mask of eq. (8), 0..=1, the same for all channels; 0 where any channel is clipped.
+    /// Mask of eq. (8), 0..=1, of all channels that are not unseen.
     pub mask: Plane,
     /// Exposure time in seconds.
     pub exposure_time: f64,

@@ -9,6 +9,10 @@ pub(super) const MISFIT: &str = source!("common/plane", "common/noise", "misfit"
 pub(super) const GAUSS: &str = source!("common/plane", "gauss");
 pub(super) const RESIDUAL: &str = source!("common/vector", "residual");
 
+/// Exposure that marks a channel as clipped at a pixel: it does not count there, whatever the mask. The kernels take all below half of it for
+/// that; noise about black does not reach there.
+pub const UNSEEN: f32 = -1.0;
+
 /// Samples of a noise curve: standard deviation of the exposure at equal steps of √exposure from 0 to 1.
 pub const NOISE_STEPS: usize = 256;
 
@@ -93,7 +97,7 @@ pub struct MisfitSource<'a> {
     pub predicted_offset: usize,
     /// (width, height) of the prediction.
     pub predicted_size: (usize, usize),
-    /// Exposure f⁻¹(Z), 1 = white.
+    /// Exposure f⁻¹(Z), 1 = white; [`UNSEEN`] where the channel does not count.
     pub exposure: &'a wgpu::Buffer,
     /// Mask of eq. (8), the same for all channels.
     pub mask: &'a wgpu::Buffer,
@@ -105,7 +109,7 @@ pub struct MisfitSource<'a> {
     pub noise: &'a [f32],
 }
 
-/// χ² of a frame's pixels, mean of the channels, and how many pixels it stands for.
+/// χ² of a frame's pixels, a third for each channel, and how many pixels it stands for, a third for each channel that counts.
 pub struct Misfit {
     /// Sum of χ².
     pub sum: wgpu::Buffer,

@@ -11,7 +11,7 @@ mod display;
 mod linear;
 
 pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
-pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, WeightTarget};
+pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, UNSEEN, WeightTarget};
 pub use display::{Display, DisplayParams, Part, Place};
 pub use linear::{HALO, LinearKernels, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, partials_1d, partials_2d};
 

@@ -353,8 +353,8 @@ impl Run<'_> {
     /// Lessens the masks of the frames with less fine structure, for a merge of blurred frames, by the square of `detail` (0..=1 per frame): a long
     /// frame has so little noise that it would count most all the same.
     pub(super) fn prefer_detail(&mut self, detail: impl Fn(usize) -> f64) {
-        for (i, mask) in self.masks.iter_mut().enumerate() {
-            let share = detail(i).powi(2).clamp(LEAST_DETAIL, 1.0) as f32;
+        self.shares = (0..self.masks.len()).map(|i| detail(i).powi(2).clamp(LEAST_DETAIL, 1.0) as f32).collect();
+        for (mask, share) in self.masks.iter_mut().zip(&self.shares) {
             mask.data.iter_mut().for_each(|m| *m *= share);
         }
     }

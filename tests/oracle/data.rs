@@ -4,8 +4,8 @@
 pub struct Pixel<'a> {
     /// Predicted irradiance.
     pub predicted: f64,
-    /// Exposure f⁻¹(Z).
-    pub exposure: f64,
+    /// Exposure f⁻¹(Z), where the channel counts.
+    pub exposure: Option<f64>,
     pub mask: f64,
     pub exposure_time: f64,
     pub black_clipped: bool,
@@ -69,25 +69,27 @@ impl Pixel<'_> {
         moments(x, deviation(self.noise, x), self.black_clipped)
     }
 
-    /// Squared residual over variance, and a bound of its f32 error: |r| carries a few roundings of the exposures and the
+    /// Squared residual over variance, 0 of what does not count, and a bound of its f32 error: |r| carries a few roundings of the exposures and the
     /// distribution function's 1.5e-7, the variance 2e-5.
     pub fn chi_squared(&self) -> (f64, f64) {
+        let Some(exposure) = self.exposure else { return (0.0, 0.0) };
         let m = self.moments();
-        let r = self.exposure - m.mean;
+        let r = exposure - m.mean;
         let chi = r * r / m.variance;
-        let dr = 5e-7 * (self.exposure.abs() + m.mean + m.variance.sqrt());
+        let dr = 5e-7 * (exposure.abs() + m.mean + m.variance.sqrt());
         (chi, 2.0 * r.abs() * dr / m.variance + dr * dr / m.variance + 2e-5 * chi)
     }
 
     /// Data weight W at a local misfit, the weighted observation W B, and the size of the terms that W B is a sum of.
     pub fn weight(&self, local: Option<(f64, f64)>, robust: f64) -> (f64, f64, f64) {
+        let Some(exposure) = self.exposure else { return (0.0, 0.0, 0.0) };
         let m = self.moments();
         let excess = local.map_or(0.0, |(chi, count)| (chi / count - 1.0).max(0.0));
         // Inverse variance of the irradiance estimate B = E + (recorded - mean)/(d mean / d E).
         let gain = self.exposure_time * m.slope;
         let w = self.mask.powi(2) / (m.variance / gain.powi(2)) / (1.0 + robust * excess);
         let e = self.predicted.max(0.0);
-        (w, w * (e + (self.exposure - m.mean) / gain), w * (e + (self.exposure + m.mean) / gain))
+        (w, w * (e + (exposure - m.mean) / gain), w * (e + (exposure + m.mean) / gain))
     }
 }
 

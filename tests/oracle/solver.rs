@@ -13,7 +13,8 @@ pub struct Frame {
     pub matrix: Matrix,
     /// The one that stands for it on the left of a step's equation.
     pub rough: Matrix,
-    pub exposure: Planes,
+    /// Where the channel counts.
+    pub exposure: [Vec<Option<f64>>; 3],
     pub mask: Vec<f64>,
     pub exposure_time: f64,
     pub noise: [Vec<f32>; 3],
@@ -55,12 +56,12 @@ impl Frame {
         }
     }
 
-    /// (χ² mean of the channels, 1) of each valid pixel, (0, 0) of the others.
+    /// (χ², 1) / 3 of each valid pixel, summed over the channels that count there.
     pub fn misfit(&self, irradiance: &Planes) -> Vec<[f64; 2]> {
         let predicted = irradiance.each_ref().map(|e| self.matrix.apply(e));
         let chi = |(i, &m): (usize, &f64)| {
-            let chi: f64 = (0..3).map(|c| self.pixel(c, i, m, &predicted).chi_squared().0).sum();
-            if m > 0.0 { [chi / 3.0, 1.0] } else { [0.0, 0.0] }
+            let shown = (0..3).filter(|&c| m > 0.0 && self.exposure[c][i].is_some());
+            shown.fold([0.0, 0.0], |sum, c| [sum[0] + self.pixel(c, i, m, &predicted).chi_squared().0 / 3.0, sum[1] + 1.0 / 3.0])
         };
         self.valid().iter().enumerate().map(chi).collect()
     }

@@ -3,6 +3,7 @@
 use std::sync::OnceLock;
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
+use unshaken::mask;
 use unshaken::metrics::{self, Judge};
 use unshaken::noise::NoiseModel;
 use unshaken::pipeline::{self, Outcome, Settings};
@@ -112,6 +113,33 @@ fn one_smoothing_serves_dim_frames_and_clean_ones() {
         };
         let (less, usual, more) = (reached(0.4), reached(1.0), reached(2.5));
         assert!(usual > less.max(more) - 0.3, "{full_well} electrons: {less:.2}, {usual:.2} by default, {more:.2} dB");
+    }
+}
+
+#[test]
+fn a_channel_that_clips_leaves_the_others_their_light() {
+    // Under a red lamp: the long frame's red is clipped nearly everywhere, and its green and blue hold the least noise.
+    let mut scene = synth::room(SIZE.0, SIZE.1, 24, 5);
+    scene.samples.0[0].data.iter_mut().for_each(|v| *v *= 6.0);
+    let made =
+        synth::capture(&scene, &Camera { full_well: 4000.0, ..Camera::default() }, &[(1.0 / 30.0, None), (0.5, None)], 0.25, 5).unwrap();
+    let frames = made.bracket.frames();
+    let alone = |p: usize| {
+        let z = frames[1].intensity.pixel(p);
+        z[0] >= mask::CLIPPED && z[1].max(z[2]) < 0.8 && frames[0].intensity.0[0].data[p] < 0.8
+    };
+    let judged: Vec<usize> = (0..SIZE.0 * SIZE.1).filter(|&p| alone(p)).collect();
+    assert!(judged.len() > 2000, "{} pixels", judged.len());
+    let error = |settings: &Settings, c: usize| {
+        let found = merge(&made.bracket, settings, None);
+        let time = frames[found.reference].exposure_time as f32;
+        let off = |&p: &usize| f64::from((found.irradiance.0[c].data[p] / time / made.truth.0[c].data[p]).max(1e-3).ln());
+        (judged.iter().map(|p| off(p).powi(2)).sum::<f64>() / judged.len() as f64).sqrt()
+    };
+    let short = Settings { exclude: vec![1], ..settings() };
+    for (c, most) in [(0, 1.02), (1, 0.6), (2, 0.6)] {
+        let (with, without) = (error(&settings(), c), error(&short, c));
+        assert!(with < most * without, "channel {c}: {with:.4}, of the short frame alone {without:.4}");
     }
 }
 

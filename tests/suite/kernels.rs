@@ -10,8 +10,8 @@ use crate::support::gpu::{POISON, buffer, gpu, kernels, planes, poisoned, read, 
 use crate::support::{assert_close, f64s, noise, uniform};
 use unshaken::gpu::{Step, grid_1d};
 use unshaken::kernels::{
-    Kernels, Misfit, MisfitSource, NOISE_STEPS, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, WeightTarget,
-    partials_1d, partials_2d,
+    Kernels, Misfit, MisfitSource, NOISE_STEPS, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, UNSEEN,
+    WeightTarget, partials_1d, partials_2d,
 };
 
 const HALF_ULP: f64 = 1.0 / (1u64 << 24) as f64;
@@ -145,6 +145,8 @@ struct Frame {
     offset: usize,
     predicted: [Vec<f32>; 3],
     exposure: [Vec<f32>; 3],
+    /// Where the channel counts.
+    seen: [Vec<bool>; 3],
     mask: Vec<f32>,
     noise: [Vec<f32>; 3],
     time: f32,
@@ -171,7 +173,8 @@ impl Frame {
         });
         let mut mask = uniform(40, m, 0.05, 1.0);
         mask.iter_mut().step_by(4).for_each(|v| *v = 0.0);
-        Self { size, offset, predicted, exposure, mask, noise, time, black_clipped }
+        let seen = std::array::from_fn(|c| uniform(50 + c as u64, m, 0.0, 1.0).iter().map(|&v| v > 0.3).collect());
+        Self { size, offset, predicted, exposure, seen, mask, noise, time, black_clipped }
     }
 
     fn stride(&self) -> usize {
@@ -186,7 +189,7 @@ impl Frame {
     fn pixel(&self, c: usize, i: usize) -> Pixel<'_> {
         Pixel {
             predicted: f64::from(self.predicted[c][self.at(i)]),
-            exposure: f64::from(self.exposure[c][i]),
+            exposure: self.seen[c][i].then_some(f64::from(self.exposure[c][i])),
             mask: f64::from(self.mask[i]),
             exposure_time: f64::from(self.time),
             black_clipped: self.black_clipped,
@@ -196,7 +199,8 @@ impl Frame {
 
     /// Calls `f` with each channel of the frame on the device.
     fn on_device(&self, mut f: impl FnMut(usize, &MisfitSource)) {
-        let (predicted, exposure, mask) = (planes(&self.predicted), planes(&self.exposure), buffer(&self.mask));
+        let marked = |c: usize| self.exposure[c].iter().zip(&self.seen[c]).map(|(&x, &seen)| if seen { x } else { UNSEEN }).collect();
+        let (predicted, exposure, mask) = (planes(&self.predicted), planes(&[0, 1, 2].map(marked)), buffer(&self.mask));
         for c in 0..3 {
             f(
                 c,
@@ -245,12 +249,12 @@ fn misfit_of_each_pixel() {
                 let chi = [0, 1, 2].map(|c| frame.pixel(c, i).chi_squared());
                 let sum = valid * chi.iter().map(|c| c.0).sum::<f64>() / 3.0;
                 expected[0].push(sum);
-                expected[1].push(valid);
+                expected[1].push(valid * frame.seen.iter().filter(|s| s[i]).count() as f64 / 3.0);
                 tolerance.push(valid * chi.iter().map(|c| c.1).sum::<f64>() / 3.0 + 3.0 * HALF_ULP * sum);
             }
             let [sum, counted] = read_misfit(&out, m);
             assert_close(&format!("misfit {size:?}, clipped {black_clipped}"), &sum, &expected[0], |i| tolerance[i]);
-            assert_close(&format!("pixels {size:?}, clipped {black_clipped}"), &counted, &expected[1], |_| 0.0);
+            assert_close(&format!("pixels {size:?}, clipped {black_clipped}"), &counted, &expected[1], |_| 2.0 * HALF_ULP);
         }
     }
 }
@@ -312,18 +316,19 @@ fn weights_and_weighted_observations() {
 }
 
 #[test]
-fn masked_pixels_weigh_exactly_nothing() {
+fn masked_and_unseen_pixels_weigh_exactly_nothing() {
     let (size, m) = ((17, 9), 17 * 9);
     let frame = Frame::new(size, 0, true);
     let none = Misfit { sum: buffer(&vec![0.0; m]), counted: buffer(&vec![0.0; m]) };
-    frame.on_device(|_, source| {
+    frame.on_device(|c, source| {
         let (weight, observation) = (poisoned(m), poisoned(m));
         let to = WeightTarget { weight: &weight, observation: &observation, offset: 0, size, accumulate: false };
         run(&k().data.weights(gpu(), source, &none, 0.0, &to));
         let (w, wb) = (read(&weight, m), read(&observation, m));
         for i in 0..m {
-            assert_eq!(frame.mask[i] == 0.0, w[i] == 0.0, "pixel {i}");
-            assert!(frame.mask[i] > 0.0 || wb[i] == 0.0, "pixel {i}");
+            let counts = frame.mask[i] > 0.0 && frame.seen[c][i];
+            assert_eq!(!counts, w[i] == 0.0, "pixel {i}");
+            assert!(counts || wb[i] == 0.0, "pixel {i}");
         }
     });
 }

@@ -54,6 +54,7 @@ const TABLE: &[(&str, &[&str])] = &[
             "gpu",
             "deblur",
             "kernels::Kernels",
+            "kernels::UNSEEN",
         ],
     ),
     // Brackets with known truth: never an estimator.

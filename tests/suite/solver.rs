@@ -8,7 +8,7 @@ use glam::DMat3;
 use unshaken::deblur::{Observation, Prior, Settings, Solution, Stop, pad_for, solve};
 use unshaken::error::Error;
 use unshaken::image::{Plane, Rgb};
-use unshaken::kernels::NOISE_STEPS;
+use unshaken::kernels::{NOISE_STEPS, UNSEEN};
 use unshaken::pose::{Pose, project};
 use unshaken::tsf::{Interpolation, TapSet, Tsf};
 
@@ -62,7 +62,9 @@ fn observe(tsf: Tsf, exposure_time: f64, pad: usize, seed: u64) -> Observation {
         let seen = |i: usize| {
             let x = clean[i] * exposure_time;
             let s = noise_curves[c][(x.clamp(0.0, 1.0).sqrt() * 255.0) as usize];
-            (x as f32 + 3f32.sqrt() * s * n[i]).clamp(0.0, 1.0)
+            let seen = (x as f32 + 3f32.sqrt() * s * n[i]).clamp(0.0, 1.0);
+            // Some of red and of blue are clipped.
+            if c != 1 && i % 7 == c { UNSEEN } else { seen }
         };
         Plane::from_vec(SIZE.0, SIZE.1, (0..clean.len()).map(seen).collect()).expect("the frame's size")
     }));
@@ -105,7 +107,7 @@ fn problem(observations: &[Observation], pad: usize, settings: &Settings) -> Pro
     let frame = |o: &Observation| Frame {
         matrix: matrix(&o.tsf, pad),
         rough: rough(&o.tsf, pad),
-        exposure: planes(&o.exposure),
+        exposure: o.exposure.0.each_ref().map(|p| p.data.iter().map(|&e| (e != UNSEEN).then_some(f64::from(e))).collect()),
         mask: f64s(&o.mask.data),
         exposure_time: o.exposure_time,
         noise: o.noise.clone(),
