@@ -48,6 +48,12 @@ pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: f32) 
     Plane { data: (0..mask.data.len()).map(one).collect(), ..grey }
 }
 
+/// [`masks`] of all channels, each frame's [`with_partly_clipped`]: how frames count in the solver.
+pub fn counting(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3]) -> Vec<Plane> {
+    let all = masks(frames, sharp, alpha, motions, Channels::ALL);
+    all.iter().zip(frames).map(|(m, f)| with_partly_clipped(m, f, alpha, 1.0)).collect()
+}
+
 /// Distance in pixels from what no frame knows up to which its light, blurred, is counted with.
 pub const UNKNOWN: usize = 10;
 

@@ -139,7 +139,7 @@ pub struct Outcome {
     pub degraded: Vec<String>,
     /// Each frame's place: the motion from the reference frame, centred pixels; of shaken frames that of their mean pose.
     pub places: Vec<DMat3>,
-    /// Masks m by which the frames counted, eq. (8), each on its own pixels.
+    /// Masks m by which the frames counted, eq. (8), each on its own pixels: by the channels that are not clipped there.
     pub masks: Vec<Plane>,
     /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
     pub misfit: Vec<Option<Plane>>,
@@ -714,6 +714,11 @@ impl Run<'_> {
         Ok(solved)
     }
 
+    /// The mask by which frame `i` counts in the solver.
+    fn counting(&self, i: usize) -> Plane {
+        mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], self.settings.alpha as f32, self.shares[i])
+    }
+
     /// Frame `i`, every channel that is not clipped by itself.
     fn observation(&self, i: usize, tsf: Tsf) -> Observation {
         let frame = &self.bracket.frames()[i];
@@ -721,7 +726,7 @@ impl Run<'_> {
         let exposure = std::array::from_fn(|c| self.exposures[i].0[c].zip(&frame.intensity.0[c], unclipped));
         Observation {
             exposure: Rgb(exposure),
-            mask: mask::with_partly_clipped(&self.masks[i], frame, self.settings.alpha as f32, self.shares[i]),
+            mask: self.counting(i),
             exposure_time: frame.exposure_time,
             noise: self.curves[i].clone(),
             black_clipped: true,
@@ -1003,7 +1008,8 @@ impl Run<'_> {
             misfit[i] = Some(plane);
         }
         let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
-        let Self { left_out, degraded, masks, .. } = self;
+        let masks = (0..frames.len()).map(|i| self.counting(i)).collect();
+        let Self { left_out, degraded, .. } = self;
         Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }
 }

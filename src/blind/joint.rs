@@ -48,8 +48,8 @@ pub struct Start {
 /// Side in pixels down to which the coarsest level shrinks the frame's longer side: there a blur is a few pixels long. Coarser, the blur of
 /// the shortest frame is less than a pixel and cannot be told.
 const COARSEST: usize = 250;
-/// Rounds of luminance and TSFs at the coarsest level and at finer ones.
-const ROUNDS: (usize, usize) = (12, 5);
+/// Rounds of luminance and TSFs at the coarsest level, at the next, and at finer ones, where little is left to be found and a round is dear.
+const ROUNDS: (usize, usize, usize) = (12, 5, 3);
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
 /// Rounds of those at the coarsest level before smoothness falls.
@@ -206,6 +206,11 @@ impl Level {
         operators
     }
 
+    /// The luminance as it is judged.
+    fn settle(&self, state: &mut State) {
+        self.solve(state, 1.0, MODEL_ERROR.1, 3);
+    }
+
     /// One round: luminance, then all TSFs, then the free warp. With `draws` the TSFs are fitted to one of the scenes that the data allow, not to the
     /// smoothest, which is the best luminance: it is blurred, and TSFs that make up for that are too short, round by round.
     fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>) {
@@ -288,19 +293,20 @@ fn coarsest(frames: &[Frame]) -> usize {
 }
 
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
-/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
-/// `false`, which it is asked after each round.
-fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
+/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `draws` as in [`Level::round`].
+/// `None` when `going` returns `false`, which it is asked after each round.
+fn at_coarsest(level: &Level, starts: &[Start], mut draws: Option<&mut Random>, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best: Option<(f64, State)> = None;
     for start in starts {
         let mut state = level.begin(start);
         for k in 0..ROUNDS.0 {
             let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None);
+            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), draws.as_deref_mut());
             if !going() {
                 return None;
             }
         }
+        level.settle(&mut state);
         let value = geometric_mean(&level.judge(&state));
         if best.as_ref().is_none_or(|b| value < b.0) {
             best = Some((value, state));
@@ -309,13 +315,34 @@ fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool)
     best.map(|b| b.1)
 }
 
+/// `state` of the level `from` on the next finer one, `level`, and `rounds` on from there. `None` as for [`at_coarsest`].
+fn at_finer(
+    level: &Level,
+    state: State,
+    from: &Level,
+    rounds: usize,
+    mut draws: Option<&mut Random>,
+    going: &mut dyn FnMut() -> bool,
+) -> Option<State> {
+    let mut state = level.refine(state, from);
+    for k in 0..rounds {
+        let t = k as f32 / (rounds - 1) as f32;
+        level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), draws.as_deref_mut());
+        if !going() {
+            return None;
+        }
+    }
+    level.settle(&mut state);
+    Some(state)
+}
+
 /// Extent of each frame's blur in pixels as the coarsest level tells it, for frames of a few hundred pixels: enough to know which of them
 /// stood still. `None` as for [`estimate`].
 pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Vec<f64>> {
     let scale = coarsest(frames);
     let (mut done, total) = (0, ROUNDS.0 * starts.len());
     let level = Level::new(frames, scale, false);
-    let state = at_coarsest(&level, starts, &mut || {
+    let state = at_coarsest(&level, starts, None, &mut || {
         done += 1;
         progress(Stage { scale, fraction: done as f32 / total as f32 })
     })?;
@@ -332,11 +359,13 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         last *= 2;
     }
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
-    let mut total = cost(first, ROUNDS.0 * starts.len());
-    let mut s = first;
+    let next = (first > last).then_some(first / 2);
+    let search = cost(first, ROUNDS.0 * starts.len());
+    let mut total = next.map_or(search, |s| 2.0 * search + 3.0 * cost(s, ROUNDS.1));
+    let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += cost(s, ROUNDS.1);
+        total += cost(s, ROUNDS.2);
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -345,21 +374,30 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     };
 
     let mut level = Level::new(frames, first, false);
-    let mut state = at_coarsest(&level, starts, &mut || advance(first))?;
-    let mut random = Random::new(SEED, 0);
-    while level.scale > last {
-        let finer = Level::new(frames, level.scale / 2, true);
-        state = finer.refine(state, &level);
-        level = finer;
-        for k in 0..ROUNDS.1 {
-            let t = k as f32 / (ROUNDS.1 - 1) as f32;
-            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
-            if !advance(level.scale) {
-                return None;
+    let mut state = at_coarsest(&level, starts, None, &mut || advance(first))?;
+    let mut draws = None;
+    if let Some(scale) = next {
+        // Without drawn scenes, with them at finer levels, and with them at all: the ones make blurs too short, the others, where a blur is not much
+        // longer than a pixel or the scene is not what the smoothness takes it for, too long. Which is right tells the second level, not the first.
+        let mut random = Random::new(SEED, 0);
+        let drawn = at_coarsest(&level, starts, Some(&mut random), &mut || advance(first))?;
+        let finer = Level::new(frames, scale, true);
+        let mut best: Option<(f64, State, Option<Random>)> = None;
+        for (from, mut random) in [(state.clone(), None), (state, Some(Random::new(SEED, 1))), (drawn, Some(random))] {
+            let state = at_finer(&finer, from, &level, ROUNDS.1, random.as_mut(), &mut || advance(scale))?;
+            let value = geometric_mean(&finer.judge(&state));
+            if best.as_ref().is_none_or(|b| value < b.0) {
+                best = Some((value, state, random));
             }
         }
+        (_, state, draws) = best?;
+        level = finer;
     }
-    level.solve(&mut state, 1.0, MODEL_ERROR.1, 3);
+    while level.scale > last {
+        let finer = Level::new(frames, level.scale / 2, true);
+        state = at_finer(&finer, state, &level, ROUNDS.2, draws.as_mut(), &mut || advance(finer.scale))?;
+        level = finer;
+    }
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
     let mut still = State {
@@ -367,7 +405,7 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         latent: shrunk(merged.0, last).padded(level.pad),
         tsfs: merged.1.iter().map(|t| t.scaled(1.0 / last as f64)).collect(),
     };
-    level.solve(&mut still, 1.0, MODEL_ERROR.1, 3);
+    level.settle(&mut still);
     let held_out_merge = level.judge(&still);
     Some(Joint {
         luminance: level.enlarged(&state.latent, last, (w, h), 0),

@@ -5,7 +5,7 @@ use super::shortcuts::{self, Action};
 use super::worker::BINS_PER_STOP;
 use super::{blur, export, strip};
 use crate::exposure::Frame;
-use crate::image::{Channels, Plane, Rgb};
+use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::tonemap::Operator;
 use crate::tsf::Model;
@@ -318,7 +318,7 @@ fn masks_at(frames: &[Frame], sharp: &[bool], alpha: f32, pixel: usize) -> Vec<f
     };
     let ones: Vec<Frame> = frames.iter().map(one).collect();
     let still = vec![glam::DMat3::IDENTITY; ones.len()];
-    mask::masks(&ones, sharp, alpha, &still, Channels::ALL).iter().map(|m| m.data[0]).collect()
+    mask::counting(&ones, sharp, alpha, &still).iter().map(|m| m.data[0]).collect()
 }
 
 fn probe(app: &App, ui: &mut egui::Ui) {

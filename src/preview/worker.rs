@@ -575,5 +575,5 @@ pub fn masks(solved: &Solved) -> Vec<Plane> {
     let frames = solved.bracket.frames();
     let sharp: Vec<bool> = (0..frames.len()).map(|i| report[i]["sharp"] == true).collect();
     let still = vec![glam::DMat3::IDENTITY; frames.len()];
-    mask::masks(frames, &sharp, solved.session.parameters.alpha as f32, &still, Channels::ALL)
+    mask::counting(frames, &sharp, solved.session.parameters.alpha as f32, &still)
 }

@@ -1,6 +1,7 @@
 //! Sparse non-negative least squares over very many candidate poses (eq. 6): only poses that the gradient asks for enter.
 
 use crate::nonnegative::coordinate_descent;
+use crate::sampling::wide;
 
 /// Candidate poses as a box of `shape` = (x, y, angle); index = (angle · ny + y) · nx + x.
 pub(super) struct ActiveSet {
@@ -35,7 +36,7 @@ impl ActiveSet {
         for _ in 0..self.rounds {
             for &id in &incoming {
                 let new = column(id);
-                let products: Vec<f64> = columns.iter().map(|old| dot(old, &new)).collect();
+                let products: Vec<f64> = wide(|| columns.iter().map(|old| dot(old, &new)).collect());
                 for (row, p) in gram.iter_mut().zip(&products) {
                     row.push(*p);
                 }
@@ -114,6 +115,7 @@ fn retain<T>(v: &mut Vec<T>, keep: &[bool]) {
 }
 
 /// Inner product with a few f32 lanes per f64 sum: fast, and exact enough for a Gram matrix of 10⁵ rows.
+#[inline]
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.chunks(64)
         .zip(b.chunks(64))
