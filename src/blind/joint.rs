@@ -66,8 +66,8 @@ const SEARCHED: usize = 20;
 const DEGREES: f64 = 2.0;
 /// Poses of a weight below this part of the largest are dropped.
 const FAINT: f64 = 0.02;
-/// Iterations for the scene that the TSFs of finer levels are fitted to, drawn around the best one, and its deviation in units of what the
-/// data leave open: so few iterations do not reach all of that, and a normal distribution does not hold it.
+/// Iterations for a scene that TSFs are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
+/// iterations do not reach all of that, and a normal distribution does not hold it.
 const DRAWN: (usize, f32) = (15, 1.5);
 /// Seed of the draws.
 const SEED: u64 = 2013;
@@ -206,7 +206,7 @@ impl Level {
         operators
     }
 
-    /// The luminance as it is judged.
+    /// The luminance as it is judged, of the TSFs that the last round left.
     fn settle(&self, state: &mut State) {
         self.solve(state, 1.0, MODEL_ERROR.1, 3);
     }
