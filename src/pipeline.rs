@@ -151,6 +151,8 @@ pub struct Outcome {
 const LARGEST_PAD: f64 = 0.15;
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
+/// Iterations of that refinement.
+const REFINED: usize = 8;
 /// Squared residual over noise variance up to which a blurred frame is believed whatever else holds: true TSFs reach 1 to 2 on noisy
 /// frames, more on clean ones, where the interpolation's own error shows.
 const HOPELESS: f64 = 8.0;
@@ -949,7 +951,7 @@ impl Run<'_> {
     }
 
     fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
-        tsf.map(|t| self.luminances(i, latent, &t.base).frame(t.base).refine(t))
+        tsf.map(|t| self.luminances(i, latent, &t.base).frame(t.base).refine(t, REFINED))
     }
 
     fn finish(

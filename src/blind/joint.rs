@@ -10,6 +10,7 @@ use crate::random::Random;
 use crate::tsf::{self, Tsf, WholeFrame};
 use glam::DMat3;
 use rayon::prelude::*;
+use serde::Serialize;
 
 /// Where the estimate is.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,6 +36,29 @@ pub struct Joint {
     pub held_out: Vec<f64>,
     /// The same for a scene solved from the frames as they are placed, unblurred: what a merge explains.
     pub held_out_merge: Vec<f64>,
+    /// The ways that were tried after the first level, the one that was gone on with first; none where there is one level.
+    pub ways: Vec<Way>,
+}
+
+/// Levels at which TSFs are fitted to drawn scenes instead of the best one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Draws {
+    /// At none.
+    None,
+    /// At all but the first.
+    Finer,
+    /// At all.
+    All,
+}
+
+/// A way to the second level, and how it did there.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Way {
+    /// Where scenes were drawn.
+    pub draws: Draws,
+    /// Geometric mean over the frames of the squared residual over noise variance on pixels that no part of the estimate has seen.
+    pub held_out: f64,
 }
 
 /// A way to begin.
@@ -49,7 +73,7 @@ pub struct Start {
 /// the shortest frame is less than a pixel and cannot be told.
 const COARSEST: usize = 250;
 /// Rounds of luminance and TSFs at the coarsest level, at the next, and at finer ones, where little is left to be found and a round is dear.
-const ROUNDS: (usize, usize, usize) = (12, 5, 3);
+const ROUNDS: (usize, usize, usize) = (12, 5, 2);
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
 /// Rounds of those at the coarsest level before smoothness falls.
@@ -69,6 +93,9 @@ const FAINT: f64 = 0.02;
 /// Iterations for a scene that TSFs are fitted to, drawn around the best one, and its deviation in units of what the data leave open: so few
 /// iterations do not reach all of that, and a normal distribution does not hold it.
 const DRAWN: (usize, f32) = (15, 1.5);
+/// Iterations by which the TSFs of a round are refined, at the coarsest level and at finer ones. More at the coarsest follow what the luminance of that
+/// round still lacks, and are lost on it: with eight the estimate takes twice as long and ends no better.
+const REFINED: (usize, usize) = (4, 8);
 /// Seed of the draws.
 const SEED: u64 = 2013;
 /// One pixel of so many is held out.
@@ -244,7 +271,7 @@ impl Level {
             Some(start) if self.near => whole.fit_around(start)?,
             _ => whole.fit_grid(&self.grid, start)?,
         };
-        without_faint(&whole.refine(&rough))
+        without_faint(&whole.refine(&rough, if self.near { REFINED.1 } else { REFINED.0 }))
     }
 
     /// Mean squared residual over variance of each frame on the held-out pixels.
@@ -292,11 +319,19 @@ fn coarsest(frames: &[Frame]) -> usize {
     scale
 }
 
+/// The one of `best` and `other` whose value is lower.
+fn better<T>(best: Option<(f64, T)>, other: (f64, T)) -> (f64, T) {
+    match best {
+        Some(best) if best.0 <= other.0 => best,
+        _ => other,
+    }
+}
+
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
 /// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `draws` as in [`Level::round`].
 /// `None` when `going` returns `false`, which it is asked after each round.
 fn at_coarsest(level: &Level, starts: &[Start], mut draws: Option<&mut Random>, going: &mut dyn FnMut() -> bool) -> Option<State> {
-    let mut best: Option<(f64, State)> = None;
+    let mut best = None;
     for start in starts {
         let mut state = level.begin(start);
         for k in 0..ROUNDS.0 {
@@ -307,10 +342,7 @@ fn at_coarsest(level: &Level, starts: &[Start], mut draws: Option<&mut Random>, 
             }
         }
         level.settle(&mut state);
-        let value = geometric_mean(&level.judge(&state));
-        if best.as_ref().is_none_or(|b| value < b.0) {
-            best = Some((value, state));
-        }
+        best = Some(better(best, (geometric_mean(&level.judge(&state)), state)));
     }
     best.map(|b| b.1)
 }
@@ -336,22 +368,68 @@ fn at_finer(
     Some(state)
 }
 
-/// Extent of each frame's blur in pixels as the coarsest level tells it, for frames of a few hundred pixels: enough to know which of them
-/// stood still. `None` as for [`estimate`].
-pub fn coarse_extents(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Vec<f64>> {
-    let scale = coarsest(frames);
-    let (mut done, total) = (0, ROUNDS.0 * starts.len());
-    let level = Level::new(frames, scale, false);
-    let state = at_coarsest(&level, starts, None, &mut || {
-        done += 1;
-        progress(Stage { scale, fraction: done as f32 / total as f32 })
-    })?;
-    Some(state.tsfs.iter().map(|t| scale as f64 * tsf::extent(t, level.size.0, level.size.1)).collect())
+/// What the coarsest level tells without drawn scenes.
+pub struct Look {
+    level: Level,
+    state: State,
 }
 
-/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with:
-/// a merge, unblurred, and where each frame lies. `progress` returning `false` ends the work: `None`, as for no start.
-pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
+impl Look {
+    /// At `frames` from the better of `starts`. `None` as for [`estimate`].
+    pub fn at(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Self> {
+        let scale = coarsest(frames);
+        let (mut done, total) = (0, ROUNDS.0 * starts.len());
+        let level = Level::new(frames, scale, false);
+        let state = at_coarsest(&level, starts, None, &mut || {
+            done += 1;
+            progress(Stage { scale, fraction: done as f32 / total as f32 })
+        })?;
+        Some(Self { level, state })
+    }
+
+    /// Extent of each frame's blur in pixels: for frames of a few hundred pixels enough to know which of them stood still.
+    pub fn extents(&self) -> Vec<f64> {
+        let (w, h) = self.level.size;
+        self.state.tsfs.iter().map(|t| self.level.scale as f64 * tsf::extent(t, w, h)).collect()
+    }
+}
+
+/// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
+/// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
+/// scene is not what the smoothness takes it for, too long. What the best way found, with the draws that it goes on with, and all ways, the
+/// best first. `None` as for [`at_coarsest`].
+fn at_second(
+    finer: &Level,
+    look: Look,
+    starts: &[Start],
+    advance: &mut dyn FnMut(usize) -> bool,
+) -> Option<(State, Option<Random>, Vec<Way>)> {
+    let Look { level, state } = look;
+    let mut random = Random::new(SEED, 0);
+    let drawn = at_coarsest(&level, starts, Some(&mut random), &mut || advance(level.scale))?;
+    let mut best = None;
+    let mut ways = Vec::new();
+    let tries = [(Draws::None, state.clone(), None), (Draws::Finer, state, Some(Random::new(SEED, 1))), (Draws::All, drawn, Some(random))];
+    for (draws, from, mut random) in tries {
+        let state = at_finer(finer, from, &level, ROUNDS.1, random.as_mut(), &mut || advance(finer.scale))?;
+        let held_out = geometric_mean(&finer.judge(&state));
+        ways.push(Way { draws, held_out });
+        best = Some(better(best, (held_out, (state, random))));
+    }
+    ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
+    best.map(|(_, (state, random))| (state, random, ways))
+}
+
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`; `look` where one at these frames from these starts was
+/// taken already. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
+/// ends the work: `None`, as for no start.
+pub fn estimate(
+    frames: &[Frame],
+    starts: &[Start],
+    look: Option<Look>,
+    merged: (&Plane, &[Tsf]),
+    progress: &mut dyn FnMut(Stage) -> bool,
+) -> Option<Joint> {
     let (w, h) = frames[0].blurred.size();
     let first = coarsest(frames);
     let mut last = 1;
@@ -361,7 +439,7 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     let next = (first > last).then_some(first / 2);
     let search = cost(first, ROUNDS.0 * starts.len());
-    let mut total = next.map_or(search, |s| 2.0 * search + 3.0 * cost(s, ROUNDS.1));
+    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + 3.0 * cost(s, ROUNDS.1));
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
@@ -373,26 +451,18 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         progress(Stage { scale, fraction: done / total })
     };
 
-    let mut level = Level::new(frames, first, false);
-    let mut state = at_coarsest(&level, starts, None, &mut || advance(first))?;
-    let mut draws = None;
-    if let Some(scale) = next {
-        // Without drawn scenes, with them at finer levels, and with them at all: the ones make blurs too short, the others, where a blur is not much
-        // longer than a pixel or the scene is not what the smoothness takes it for, too long. Which is right tells the second level, not the first.
-        let mut random = Random::new(SEED, 0);
-        let drawn = at_coarsest(&level, starts, Some(&mut random), &mut || advance(first))?;
-        let finer = Level::new(frames, scale, true);
-        let mut best: Option<(f64, State, Option<Random>)> = None;
-        for (from, mut random) in [(state.clone(), None), (state, Some(Random::new(SEED, 1))), (drawn, Some(random))] {
-            let state = at_finer(&finer, from, &level, ROUNDS.1, random.as_mut(), &mut || advance(scale))?;
-            let value = geometric_mean(&finer.judge(&state));
-            if best.as_ref().is_none_or(|b| value < b.0) {
-                best = Some((value, state, random));
-            }
+    let look = match look {
+        Some(look) => look,
+        None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
+    };
+    let (mut level, mut state, mut draws, ways) = match next {
+        None => (look.level, look.state, None, Vec::new()),
+        Some(scale) => {
+            let finer = Level::new(frames, scale, true);
+            let (state, draws, ways) = at_second(&finer, look, starts, &mut advance)?;
+            (finer, state, draws, ways)
         }
-        (_, state, draws) = best?;
-        level = finer;
-    }
+    };
     while level.scale > last {
         let finer = Level::new(frames, level.scale / 2, true);
         state = at_finer(&finer, state, &level, ROUNDS.2, draws.as_mut(), &mut || advance(finer.scale))?;
@@ -414,5 +484,6 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         reference: state.reference,
         held_out,
         held_out_merge,
+        ways,
     })
 }

@@ -89,7 +89,7 @@ impl Default for Settings {
             epsilon: 0.01,
             outer: 8,
             inner: 16,
-            tolerance: 1e-2,
+            tolerance: 2e-2,
             robust: 1.0,
             settled: 0.5,
             reweight: true,

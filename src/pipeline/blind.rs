@@ -1,7 +1,7 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run};
-use crate::blind::{self, Frame, Lack, PatchSetup, Start};
+use crate::blind::{self, Frame, Lack, Look, PatchSetup, Start};
 use crate::deblur;
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
@@ -36,6 +36,15 @@ pub(super) struct Found {
     pub reference: usize,
     /// Whether the TSFs were estimated at a smaller size than the frame's.
     pub reduced: bool,
+}
+
+/// What a look at some frames told.
+struct Seen {
+    frames: Vec<usize>,
+    /// Extents in pixels of their blurs.
+    extents: Vec<f64>,
+    /// The look itself where it was at the frames as a whole.
+    look: Option<Look>,
 }
 
 /// Held-out χ² of the joint estimate over that of the merge below which it is believed.
@@ -141,21 +150,25 @@ impl Run<'_> {
         if self.settings.blind == Blind::Patches {
             return Ok((self.patches(used, from, to)?, Vec::new()));
         }
-        let Some(doubted) = doubted else { return Ok((self.joint(used, false, from, to)?, Vec::new())) };
+        let Some(doubted) = doubted else { return Ok((self.joint(used, None, false, from, to)?, Vec::new())) };
         let at = |part: f32| from + part * (to - from);
+        let told = |seen: &Option<Seen>| seen.as_ref().map_or_else(Vec::new, |seen| seen.extents.clone());
         let all_moved = |extents: &[f64]| !extents.is_empty() && extents.iter().all(|e| *e > SHAKEN);
-        let extents = self.coarse_extents(doubted, from, at(0.2))?;
+        let mut seen = self.look(doubted, from, at(0.2))?;
+        let extents = told(&seen);
         let shaken: Vec<usize> = doubted.iter().zip(&extents).filter(|(_, e)| **e > SURELY_SHAKEN).map(|(i, _)| *i).collect();
         let mut none_still = all_moved(&extents);
         if !none_still && !shaken.is_empty() && doubted.len() - shaken.len() == 1 && doubted.len() < used.len() {
             // One alone stands still beside another's motion, whatever it did itself: the others tell.
-            none_still = all_moved(&self.coarse_extents(used, at(0.2), at(0.3))?);
+            seen = self.look(used, at(0.2), at(0.3))?;
+            none_still = all_moved(&told(&seen));
         }
         if !none_still {
             let still: Vec<usize> = doubted.iter().copied().filter(|i| !shaken.contains(i)).collect();
             return Ok((None, self.confirmed(shaken, &still)));
         }
-        let found = self.joint(used, true, at(0.3), to)?;
+        let look = seen.filter(|seen| seen.frames == used).and_then(|seen| seen.look);
+        let found = self.joint(used, look, true, at(0.3), to)?;
         Ok((found, doubted.to_vec()))
     }
 
@@ -186,11 +199,10 @@ impl Run<'_> {
         order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
-    /// Extents in pixels of the blurs of `frames`: by the joint estimate of a part of the frame with much texture, at its coarsest level. Empty
-    /// where that cannot be told.
-    fn coarse_extents(&mut self, frames: &[usize], from: f32, to: f32) -> Result<Vec<f64>> {
+    /// A look at `frames`: the joint estimate of a part of the frame with much texture, at its coarsest level; `None` where there is none to be had.
+    fn look(&mut self, frames: &[usize], from: f32, to: f32) -> Result<Option<Seen>> {
         if frames.len() < 2 {
-            return Ok(Vec::new());
+            return Ok(None);
         }
         let (w, h) = self.bracket.size();
         // Where each frame's window lies, from the reference's: to the pixel.
@@ -203,7 +215,7 @@ impl Run<'_> {
         let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
         let (ww, wh) = (longest(rw, rh), longest(rh, rw));
         if ww.min(wh) < LEAST_WINDOW {
-            return Ok(Vec::new());
+            return Ok(None);
         }
         let (mx, my) = (most.x as usize, most.y as usize);
         let channels = self.most_telling(frames, frames);
@@ -211,7 +223,7 @@ impl Run<'_> {
         let first = &whole[0];
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);
-        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(Vec::new()) };
+        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(None) };
         let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
         let centre = DVec2::new((x + ww / 2) as f64, (y + wh / 2) as f64) - corner;
         let turned = |i: usize| {
@@ -222,7 +234,7 @@ impl Run<'_> {
             })
         };
         if frames.iter().any(|&i| turned(i)) {
-            return Ok(Vec::new());
+            return Ok(None);
         }
         let at = |i: usize| {
             let s = shift(i, centre);
@@ -238,14 +250,15 @@ impl Run<'_> {
             })
             .collect();
         let events = &mut self.events;
-        let extents = blind::coarse_extents(&cut, &starts, &mut |s| {
+        let look = Look::at(&cut, &starts, &mut |s| {
             let stage = "no frame is surely sharp: looking whether all moved".into();
             events(Event::Progress { stage, fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
         let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
+        let extents = look.extents();
         self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": extents });
-        Ok(extents)
+        Ok(Some(Seen { extents, look: ((ww, wh) == (w, h)).then_some(look), frames: frames.to_vec() }))
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
@@ -292,8 +305,8 @@ impl Run<'_> {
         Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference], reduced: false }))
     }
 
-    /// The joint estimate.
-    fn joint(&mut self, used: &[usize], doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
+    /// The joint estimate, after `look` at all of the frames where there was one.
+    fn joint(&mut self, used: &[usize], look: Option<Look>, doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
         let channels = self.most_telling(used, used);
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
@@ -301,7 +314,7 @@ impl Run<'_> {
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
-        let found = blind::estimate(&frames, &starts, (&merged.mean_of(channels), &still), &mut |s| {
+        let found = blind::estimate(&frames, &starts, look, (&merged.mean_of(channels), &still), &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
@@ -321,6 +334,7 @@ impl Run<'_> {
             "estimated_at_scale": found.scale,
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
+            "ways": found.ways,
         });
         if !believed && doubtful {
             return Ok(None);

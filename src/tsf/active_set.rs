@@ -8,6 +8,9 @@ pub(super) struct ActiveSet {
     pub shape: (usize, usize, usize),
     /// λ of the L1 term as a part of the largest entry of Aᵀb.
     pub lambda: f64,
+    /// Standard deviation of what the start leaves of the target, per row: λ is at least what the gradient of such noise does not exceed among all
+    /// candidates, `√(2 ln n)` times a column's length.
+    pub noise: f64,
     pub rounds: usize,
 }
 
@@ -20,33 +23,34 @@ impl ActiveSet {
         start: &[usize],
         target: &[f32],
         mut gradient: impl FnMut(&[f32]) -> Vec<f64>,
-        mut column: impl FnMut(usize) -> Vec<f32>,
+        column: impl Fn(usize) -> Vec<f32>,
     ) -> Vec<(usize, f64)> {
         let c_all = gradient(target);
         let largest = c_all.iter().fold(0.0f64, |m, v| m.max(*v));
         if largest <= 0.0 {
             return Vec::new();
         }
-        let lambda = self.lambda * largest;
+        let length = |id: usize| {
+            let column = column(id);
+            dot(&column, &column).sqrt()
+        };
+        let least = start.get(start.len() / 2).map_or(0.0, |&id| self.noise * (2.0 * (c_all.len() as f64).ln()).sqrt() * length(id));
+        let lambda = (self.lambda * largest).max(least);
         let mut ids: Vec<usize> = Vec::new();
         let mut columns: Vec<Vec<f32>> = Vec::new();
         let mut gram: Vec<Vec<f64>> = Vec::new();
         let mut h: Vec<f64> = Vec::new();
         let mut incoming: Vec<usize> = if start.is_empty() { self.maxima(&c_all, lambda, &ids) } else { start.to_vec() };
         for _ in 0..self.rounds {
-            for &id in &incoming {
-                let new = column(id);
-                let products: Vec<f64> = wide(|| columns.iter().map(|old| dot(old, &new)).collect());
-                for (row, p) in gram.iter_mut().zip(&products) {
-                    row.push(*p);
-                }
-                let mut row = products;
-                row.push(dot(&new, &new));
-                gram.push(row);
-                columns.push(new);
-                ids.push(id);
-                h.push(0.0);
+            let first = columns.len();
+            columns.extend(incoming.iter().map(|&id| column(id)));
+            ids.extend(&incoming);
+            h.resize(ids.len(), 0.0);
+            let products = wide(|| products(&columns, first));
+            for (i, row) in gram.iter_mut().enumerate() {
+                row.extend(products.iter().map(|p| p[i]));
             }
+            gram.extend(products);
             let flat: Vec<f64> = gram.iter().flatten().copied().collect();
             let c: Vec<f64> = ids.iter().map(|&i| c_all[i]).collect();
             coordinate_descent(&flat, &c, lambda, &mut h, 200, 1e-4);
@@ -113,6 +117,26 @@ fn retain<T>(v: &mut Vec<T>, keep: &[bool]) {
         keep[i - 1]
     });
 }
+
+/// Inner products of each of `columns` from the one numbered `first` on with all of them. In blocks of rows, so that what the processor's caches
+/// hold is used for all pairs.
+#[inline]
+fn products(columns: &[Vec<f32>], first: usize) -> Vec<Vec<f64>> {
+    let new = &columns[first..];
+    let mut sums = vec![vec![0.0f64; columns.len()]; new.len()];
+    for from in (0..new.first().map_or(0, Vec::len)).step_by(ROWS) {
+        for (i, old) in columns.iter().enumerate() {
+            let rows = from..(from + ROWS).min(old.len());
+            for (sums, new) in sums.iter_mut().zip(new) {
+                sums[i] += dot(&old[rows.clone()], &new[rows.clone()]);
+            }
+        }
+    }
+    sums
+}
+
+/// Rows of a block of [`products`].
+const ROWS: usize = 1024;
 
 /// Inner product with a few f32 lanes per f64 sum: fast, and exact enough for a Gram matrix of 10⁵ rows.
 #[inline]

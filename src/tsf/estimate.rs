@@ -341,8 +341,8 @@ impl WholeFrame<'_> {
         Some(Estimate { tsf: found.tsf.about(self.base), ..found })
     }
 
-    /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model.
-    pub fn refine(&self, tsf: &Tsf) -> Tsf {
+    /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model, for at most so many `iterations`.
+    pub fn refine(&self, tsf: &Tsf, iterations: usize) -> Tsf {
         let (w, h) = self.size();
         let mut l = 0;
         while extent(tsf, w, h) > FINEST_EXTENT * f64::from(1 << l) && w.min(h) >> (l + 1) >= SMALLEST {
@@ -355,7 +355,7 @@ impl WholeFrame<'_> {
         let chart = Chart::new(model_of(tsf), tsf.focal_px / scale, size.0, size.1);
         let Some(start) = gathered(&tsf.scaled(1.0 / scale), &chart) else { return tsf.clone() };
         let rows = frame.rows(ROWS, margin(&start, size));
-        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, 8), scale).about(self.base)
+        filled(&Evidence::new(&frame, &rows).refine(&start, &chart, iterations), scale).about(self.base)
     }
 
     /// Sparse poses within a pixel's step of those of `start`, in roll and translation, where that is already near; `None` when nothing

@@ -59,6 +59,6 @@ pub fn from_psfs(patches: &[(Patch, Psf)], grid: &PoseGrid, width: usize, height
         }
         dense
     };
-    let found = ActiveSet { shape: n, lambda: 1e-2, rounds: 30 }.solve(&[], &target, gradient, column);
+    let found = ActiveSet { shape: n, lambda: 1e-2, noise: 0.0, rounds: 30 }.solve(&[], &target, gradient, column);
     Tsf::new(focal, found.into_iter().map(|(id, w)| Pose { weight: w, ..pose(id) }).collect()).ok()
 }

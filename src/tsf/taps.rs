@@ -93,8 +93,8 @@ const ROUGH_TOLERANCE: f64 = 1.2;
 
 /// Taps below this fraction of the largest are dropped: together they are below the 8-bit quantisation of any pixel.
 const NEGLIGIBLE: f64 = 5e-4;
-/// The same for [`TapSet::rougher`]: a few per cent of the weight are dropped.
-const ROUGHLY_NEGLIGIBLE: f64 = 5e-3;
+/// The same for [`TapSet::rougher`]: several per cent of the weight are dropped.
+const ROUGHLY_NEGLIGIBLE: f64 = 2e-2;
 
 /// What a load of a warp, which has its own arithmetic, costs in taps: a bicubic warp of sixteen and its adjoint take 100 ns per pixel of three
 /// channels on lavapipe, a tap and its adjoint 2.1 ns.

@@ -5,6 +5,7 @@
 
 use super::Tsf;
 use super::active_set::ActiveSet;
+use super::continuous::Evidence;
 use super::from_psfs::nominal_focal;
 use super::taps::Interpolation;
 use crate::fft::{Fft2, Spectrum};
@@ -26,6 +27,9 @@ pub struct WholeFrame<'a> {
     /// Motion of the frame as a whole, about which the poses are looked for (see [`Tsf::base`]).
     pub base: DMat3,
 }
+
+/// Differences that a search of a grid of poses looks at, from nothing and from a start.
+const ROWS: (usize, usize) = (40_000, 14_000);
 
 /// A weighted difference of two neighbouring pixels.
 #[derive(Clone, Copy)]
@@ -120,13 +124,15 @@ impl WholeFrame<'_> {
             .collect()
     }
 
-    /// TSF over the integer translations and the angles of `grid`, started from the poses of `start`; `None` when nothing fits.
+    /// TSF over the integer translations and the angles of `grid`, started from the poses of `start`; `None` when nothing fits. From a start λ
+    /// follows what that leaves unexplained, as for [`WholeFrame::fit_around`].
     pub fn fit_grid(&self, grid: &PoseGrid, start: Option<&Tsf>) -> Option<Tsf> {
         let (w, h) = self.size();
         let focal = nominal_focal(w, h);
         let r = grid.radius;
         let n = 2 * r + 1;
-        let rows = self.rows(40_000, 0);
+        let rows = self.rows(if start.is_none() { ROWS.0 } else { ROWS.1 }, 0);
+        let noise = start.map_or(0.0, |t| Evidence::new(self, &rows).misfit(t).sqrt());
         let targets = self.targets(&rows);
         let bases: Vec<Plane> = grid
             .angles_deg
@@ -191,7 +197,8 @@ impl WholeFrame<'_> {
             ids.dedup();
             ids
         });
-        let found = ActiveSet { shape: (n, n, grid.angles_deg.len()), lambda: 2e-3, rounds: 20 }.solve(&start, &targets, gradient, column);
+        let found =
+            ActiveSet { shape: (n, n, grid.angles_deg.len()), lambda: 2e-3, noise, rounds: 20 }.solve(&start, &targets, gradient, column);
         let poses = found
             .into_iter()
             .map(|(id, weight)| {

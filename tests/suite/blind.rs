@@ -2,7 +2,7 @@
 
 use crate::oracle::blur as oracle;
 use crate::support::{assert_close, f64s, noise, uniform};
-use unshaken::blind::{self, Frame, Lack, Operator, PatchSetup, Start, fix_warp};
+use unshaken::blind::{self, Draws, Frame, Lack, Look, Operator, PatchSetup, Stage, Start, fix_warp};
 use unshaken::image::Plane;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch, Psf};
@@ -75,14 +75,18 @@ const PAD: usize = 20;
 
 /// Three frames of `tiles` under `tsfs`, noise of half a per cent.
 fn frames(latent: &Plane, tsfs: &[Tsf]) -> Vec<Frame> {
+    frames_of(SIZE, latent, tsfs)
+}
+
+fn frames_of(size: (usize, usize), latent: &Plane, tsfs: &[Tsf]) -> Vec<Frame> {
     let frame = |(k, tsf): (usize, &Tsf)| {
-        let clean = Operator::new(tsf, SIZE.0, SIZE.1, PAD).forward(&latent.data);
+        let clean = Operator::new(tsf, size.0, size.1, PAD).forward(&latent.data);
         // The sum of twelve uniform numbers, less their mean, is close to a normal one.
         let draws = uniform(50 + k as u64, 12 * clean.len(), 0.0, 1.0);
         let noisy = clean.iter().enumerate().map(|(p, v)| v + 0.005 * (draws[12 * p..12 * p + 12].iter().sum::<f32>() - 6.0));
-        let of = |value: f32| Plane::filled(SIZE.0, SIZE.1, value);
+        let of = |value: f32| Plane::filled(size.0, size.1, value);
         let blurred = Plane { data: noisy.collect(), ..of(0.0) };
-        Frame { blurred, variance: of(0.005 * 0.005), mask: of(1.0), clipped: vec![false; SIZE.0 * SIZE.1] }
+        Frame { blurred, variance: of(0.005 * 0.005), mask: of(1.0), clipped: vec![false; size.0 * size.1] }
     };
     tsfs.iter().enumerate().map(frame).collect()
 }
@@ -135,7 +139,7 @@ fn scene_and_shakes_are_found_together() {
     let merged = mean(&frames);
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = 0.0;
-    let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, None, (&merged, &still()), &mut |s| {
         assert!(s.fraction >= last && s.fraction <= 1.001, "progress goes on: {last} to {}", s.fraction);
         last = s.fraction;
         true
@@ -154,10 +158,57 @@ fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
     let merged = mean(&frames);
-    let found = blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], (&merged, &still()), &mut |_| true).unwrap();
+    let found =
+        blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], None, (&merged, &still()), &mut |_| true).unwrap();
     for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
         assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
     }
+}
+
+/// A frame of more than 250 px has a second level, whose held-out pixels tell whether drawn scenes help.
+#[test]
+fn the_way_with_the_least_residual_at_the_second_level_goes_on() {
+    let size = (264, 48);
+    let frames = frames_of(size, &tiles(size.0 + 2 * PAD, size.1 + 2 * PAD), &shakes());
+    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+    let mut last = Stage { scale: 2, fraction: 0.0 };
+    let found = blind::estimate(&frames, &starts, None, (&frames[1].blurred, &still()), &mut |s| {
+        assert!(s.fraction > last.fraction && s.scale <= last.scale, "progress goes on: {last:?} to {s:?}");
+        last = s;
+        true
+    })
+    .unwrap();
+    assert!(last.scale == 1 && (last.fraction - 1.0).abs() < 1e-3, "the end is announced as {last:?}");
+    assert!([Draws::None, Draws::Finer, Draws::All].iter().all(|d| found.ways.iter().any(|w| w.draws == *d)), "{:?}", found.ways);
+    assert!(found.ways.len() == 3 && found.ways.iter().all(|w| w.held_out >= found.ways[0].held_out), "{:?}", found.ways);
+    // The second level is the last one here.
+    let end = blind::geometric_mean(&found.held_out);
+    assert!((end - found.ways[0].held_out).abs() < 1e-9 * end, "{:?} and in the end {end}", found.ways);
+    assert!(end < 0.25 * blind::geometric_mean(&found.held_out_merge), "{end}, the merge {:?}", found.held_out_merge);
+}
+
+#[test]
+fn a_look_that_was_taken_serves_the_estimate() {
+    let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
+    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+    let merged = mean(&frames);
+    let look = Look::at(&frames, &starts, &mut |_| true).unwrap();
+    let extents = look.extents();
+    let mut rounds = 0;
+    let mut estimate = |look: Option<Look>| {
+        rounds = 0;
+        let found = blind::estimate(&frames, &starts, look, (&merged, &still()), &mut |_| {
+            rounds += 1;
+            true
+        });
+        (found.unwrap(), rounds)
+    };
+    let ((again, some), (whole, all)) = (estimate(Some(look)), estimate(None));
+    assert!(some < all, "{some} rounds after the look, {all} without");
+    assert_eq!(again.luminance.data, whole.luminance.data);
+    assert_eq!(again.held_out, whole.held_out);
+    let found: Vec<f64> = whole.tsfs.iter().map(|t| tsf::extent(t, SIZE.0, SIZE.1)).collect();
+    assert_eq!(extents, found, "there is one level");
 }
 
 #[test]
@@ -165,7 +216,7 @@ fn the_joint_estimate_can_be_cancelled() {
     let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut calls = 0;
-    let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| {
+    let found = blind::estimate(&frames, &starts, None, (&mean(&frames), &still()), &mut |_| {
         calls += 1;
         calls < 2
     });

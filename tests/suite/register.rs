@@ -189,7 +189,7 @@ fn a_tsf_is_found_about_the_motion_of_its_frame() {
     let frame = WholeFrame { latent: &latent, pad: 32, blurred: &blurred, weight: &weight, base };
     let found = frame.fit_grid(&unshaken::pose::PoseGrid::new(w, h, 6, 0.5, 1.0), None).expect("something fits");
     assert_eq!(found.base, base);
-    let refined = frame.refine(&found);
+    let refined = frame.refine(&found, 8);
     assert_eq!(refined.base, base);
     let m = refined.mean();
     assert!((m.t_x - 1.2).abs() < 0.1 && (m.t_y - 0.4).abs() < 0.1 && m.theta_z_deg.abs() < 0.05, "{m:?}");

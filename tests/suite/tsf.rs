@@ -210,7 +210,7 @@ fn refinement_brings_a_rough_tsf_home() {
     let frame = WholeFrame { latent: &latent, pad: PAD, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
     let grid = PoseGrid::new(SIZE.0, SIZE.1, 8, 1.5, 1.0);
     let rough = frame.fit_grid(&grid, None).expect("something fits");
-    let fine = frame.refine(&rough);
+    let fine = frame.refine(&rough, 8);
     let error = |t: &Tsf| operator_error(&latent, PAD, t, &truth, SIZE);
     let (a, b) = (error(&rough), error(&fine));
     assert!(b < 0.05 && b < 0.5 * a, "operator error {a:.3} on the grid, {b:.3} refined");
