@@ -26,6 +26,7 @@ use std::time::Instant;
 mod blind;
 mod engine;
 
+use blind::AllBlurs;
 pub use blind::Blind;
 pub use engine::Engine;
 use engine::Memo;
@@ -504,24 +505,24 @@ impl Run<'_> {
         let mut reduced = false;
         let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
         let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
-        let doubted = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
+        let doubt = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {
             self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
-        } else if forced || doubted.is_some() || (!all_known && !sharp.contains(&true)) {
-            let ((found, moved), motions, blind, degraded) = self.remembered(
+        } else if forced || doubt.is_some() || (!all_known && !sharp.contains(&true)) {
+            let (found, motions, blind, degraded) = self.remembered(
                 "all blurs",
                 "",
                 |_| 0,
                 |run| {
-                    let found = run.all_blurs(&used, doubted.as_deref(), 0.03, 0.60)?;
+                    let found = run.all_blurs(&used, doubt.as_ref(), 0.03, 0.60)?;
                     Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
                 },
             )?;
             (self.motions, self.blind, self.degraded) = (motions, blind, degraded);
             match found {
-                Some(found) => {
+                AllBlurs::Found(found) => {
                     scene = Some(found.start);
                     centre = Some(found.reference);
                     reduced = found.reduced;
@@ -530,21 +531,8 @@ impl Run<'_> {
                         tsfs[i] = Some(tsf);
                     }
                 }
-                None if doubted.is_none() => unexplained = true,
-                None => {
-                    let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-                    match blind::settled(&passing, &moved) {
-                        Some(still) => sharp.iter_mut().enumerate().for_each(|(i, s)| *s = still.contains(&i)),
-                        None => {
-                            self.degrade(
-                                "every frame that could be sharp seems to have moved, and camera shake does not explain the frames: they are \
-                                 merged without deblurring, the least blurred weighted most (--sharp names frames that are sharp)"
-                                    .into(),
-                            )?;
-                            unexplained = true;
-                        }
-                    }
-                }
+                AllBlurs::Sharp(still) => sharp.iter_mut().enumerate().for_each(|(i, s)| *s = still.contains(&i)),
+                AllBlurs::Unexplained => unexplained = true,
             }
         } else if !sharp.contains(&true) {
             scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);

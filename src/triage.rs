@@ -27,6 +27,13 @@ pub struct Verdict {
     pub reason: String,
 }
 
+impl Verdict {
+    /// Whether the frame is as sharp as any: sharp, or of a scene (or a lens) without steep edges, or blurred like all others.
+    pub fn is_alike(&self) -> bool {
+        self.sharp || (self.compared && self.detail >= DETAIL)
+    }
+}
+
 /// Below this share of another frame's fine structure a frame is blurred: a blur of 2 px halves the energy of one-pixel differences
 /// across its direction. In place, sharp frames measure 0.74 and more, shaken ones 0.63 and less.
 const DETAIL: f64 = 0.68;

@@ -36,6 +36,8 @@ pub struct Joint {
     pub held_out: Vec<f64>,
     /// The same for a scene solved from the frames as they are placed, unblurred: what a merge explains.
     pub held_out_merge: Vec<f64>,
+    /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
+    pub if_still: f64,
     /// The ways that were tried after the first level, the one that was gone on with first; none where there is one level.
     pub ways: Vec<Way>,
 }
@@ -96,6 +98,8 @@ const DRAWN: (usize, f32) = (15, 1.5);
 /// Iterations by which the TSFs of a round are refined, at the coarsest level and at finer ones. More at the coarsest follow what the luminance of that
 /// round still lacks, and are lost on it: with eight the estimate takes twice as long and ends no better.
 const REFINED: (usize, usize) = (4, 8);
+/// Rounds of luminance and TSFs under the assumption that frames did not move.
+const STILLED: usize = 4;
 /// Seed of the draws.
 const SEED: u64 = 2013;
 /// One pixel of so many is held out.
@@ -201,6 +205,19 @@ struct State {
     tsfs: Vec<Tsf>,
 }
 
+impl State {
+    /// Takes the TSFs that were found, and fixes the free warp.
+    fn take(&mut self, fits: Vec<Option<Tsf>>) {
+        for (tsf, fit) in self.tsfs.iter_mut().zip(fits) {
+            if let Some(fit) = fit {
+                *tsf = fit;
+            }
+        }
+        let m = fix_warp(&mut self.tsfs, self.reference);
+        self.latent = warp(&self.latent, &m);
+    }
+}
+
 impl Level {
     fn new(frames: &[Frame], scale: usize, near: bool) -> Self {
         let longer = frames[0].blurred.width.max(frames[0].blurred.height);
@@ -249,22 +266,48 @@ impl Level {
         let latent = drawn.as_ref().unwrap_or(&state.latent);
         let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, latent, Some(t), model_error));
         let fits: Vec<Option<Tsf>> = fits.collect();
-        for (tsf, fit) in state.tsfs.iter_mut().zip(fits) {
-            if let Some(fit) = fit {
-                *tsf = fit;
-            }
-        }
-        let m = fix_warp(&mut state.tsfs, state.reference);
-        state.latent = warp(&state.latent, &m);
+        state.take(fits);
     }
 
-    fn fit(&self, frame: &Frame, latent: &Plane, start: Option<&Tsf>, model_error: f32) -> Option<Tsf> {
+    /// `state` if the frames `still` had not moved: each as far as its mean pose went, and those and the other frames' TSFs follow.
+    fn stilled(&self, state: &State, still: &[usize]) -> State {
+        let mut state = state.clone();
+        for &k in still {
+            let mean = Pose { weight: 1.0, ..state.tsfs[k].mean() };
+            state.tsfs[k].poses = vec![mean];
+        }
+        let error = MODEL_ERROR.1;
+        for _ in 0..STILLED {
+            self.solve(&mut state, 1.0, error, 3);
+            let fit = |k: usize| {
+                let (frame, tsf) = (&self.frames[k], &state.tsfs[k]);
+                if !still.contains(&k) {
+                    return self.fit(frame, &state.latent, Some(tsf), error);
+                }
+                let weight = self.weight(frame, error);
+                let whole =
+                    WholeFrame { latent: &state.latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
+                Some(whole.refine(tsf, REFINED.1))
+            };
+            let fits: Vec<Option<Tsf>> = (0..self.frames.len()).into_par_iter().map(fit).collect();
+            state.take(fits);
+        }
+        self.settle(&mut state);
+        state
+    }
+
+    /// How much the pixels of `frame` count for its TSF where operators err by `model_error`.
+    fn weight(&self, frame: &Frame, model_error: f32) -> Plane {
         let local = gradient_level(&frame.blurred, 4);
         let weight = |p: usize| {
             let m = if self.known[p] && !self.held[p] { frame.mask.data[p] } else { 0.0 };
             m * m / (frame.variance.data[p] + (model_error * local.data[p]).powi(2))
         };
-        let weight = Plane { data: (0..local.data.len()).map(weight).collect(), ..local };
+        Plane { data: (0..local.data.len()).map(weight).collect(), ..local }
+    }
+
+    fn fit(&self, frame: &Frame, latent: &Plane, start: Option<&Tsf>, model_error: f32) -> Option<Tsf> {
+        let weight = self.weight(frame, model_error);
         let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
         // Faint poses are the fit's answer to noise and to what the luminance still lacks; unchecked, they widen the TSF round by round.
         let rough = match start {
@@ -272,6 +315,12 @@ impl Level {
             _ => whole.fit_grid(&self.grid, start)?,
         };
         without_faint(&whole.refine(&rough, if self.near { REFINED.1 } else { REFINED.0 }))
+    }
+
+    /// See [`Look::if_still`].
+    fn growth(&self, state: &State, still: &[usize]) -> f64 {
+        let judge = |state: &State| geometric_mean(&self.judge(state));
+        judge(&self.stilled(state, still)) / judge(state)
     }
 
     /// Mean squared residual over variance of each frame on the held-out pixels.
@@ -387,6 +436,13 @@ impl Look {
         Some(Self { level, state })
     }
 
+    /// By how much the residuals of all frames (geometric mean) grow if the frames `still`, positions among those looked at, did not move. Sharp
+    /// frames of a scene with soft edges, displaced by parts of a pixel, are explained as well by a scene with harder ones and some blur:
+    /// an extent alone does not tell.
+    pub fn if_still(&self, still: &[usize]) -> f64 {
+        self.level.growth(&self.state, still)
+    }
+
     /// Extent of each frame's blur in pixels: for frames of a few hundred pixels enough to know which of them stood still.
     pub fn extents(&self) -> Vec<f64> {
         let (w, h) = self.level.size;
@@ -421,12 +477,13 @@ fn at_second(
 }
 
 /// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`; `look` where one at these frames from these starts was
-/// taken already. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
+/// taken already. `doubted`: frames that may not have moved. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
 /// ends the work: `None`, as for no start.
 pub fn estimate(
     frames: &[Frame],
     starts: &[Start],
     look: Option<Look>,
+    doubted: &[usize],
     merged: (&Plane, &[Tsf]),
     progress: &mut dyn FnMut(Stage) -> bool,
 ) -> Option<Joint> {
@@ -469,6 +526,7 @@ pub fn estimate(
         level = finer;
     }
     let held_out = level.judge(&state);
+    let if_still = if doubted.is_empty() { 1.0 } else { level.growth(&state, doubted) };
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
     let mut still = State {
         reference: state.reference,
@@ -484,6 +542,7 @@ pub fn estimate(
         reference: state.reference,
         held_out,
         held_out_merge,
+        if_still,
         ways,
     })
 }

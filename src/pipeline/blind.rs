@@ -38,13 +38,42 @@ pub(super) struct Found {
     pub reduced: bool,
 }
 
-/// What a look at some frames told.
+/// A look at some frames.
 struct Seen {
     frames: Vec<usize>,
-    /// Extents in pixels of their blurs.
-    extents: Vec<f64>,
-    /// The look itself where it was at the frames as a whole.
-    look: Option<Look>,
+    look: Look,
+    /// Whether it was at the frames as a whole.
+    whole: bool,
+}
+
+impl Seen {
+    /// Those of `frames` whose blurs are longer than `extent` pixels.
+    fn beyond(&self, frames: &[usize], extent: f64) -> Vec<usize> {
+        let found = self.frames.iter().zip(self.look.extents());
+        found.filter(|(i, e)| frames.contains(i) && *e > extent).map(|(i, _)| *i).collect()
+    }
+
+    fn all_moved(&self) -> bool {
+        self.beyond(&self.frames, SHAKEN).len() == self.frames.len()
+    }
+}
+
+/// What became of a bracket without a frame that is surely sharp.
+#[derive(Clone)]
+pub(super) enum AllBlurs {
+    /// All blurs were found.
+    Found(Found),
+    /// These frames are sharp.
+    Sharp(Vec<usize>),
+    /// Nothing is to be deblurred by: what had to be said has been said.
+    Unexplained,
+}
+
+/// Frames that may be sharp, of which none surely is.
+pub(super) struct Doubt {
+    frames: Vec<usize>,
+    /// Those of them that pass for sharp.
+    passing: Vec<usize>,
 }
 
 /// Held-out χ² of the joint estimate over that of the merge below which it is believed.
@@ -59,6 +88,9 @@ const LEAST_DETAIL: f64 = 0.1;
 const SURELY_STEEP: f64 = 0.57;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
+/// Growth of the residuals, if a frame alone or several did not move, up to which they did not: sharp frames in place and displaced measure up to 1.3
+/// and 1.5, frames blurred by 4 px and more from 1.7 and 2.9 on.
+const STOOD_STILL: (f64, f64) = (1.5, 2.0);
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
 /// measure up to 1.6.
 const SURELY_SHAKEN: f64 = 3.0;
@@ -73,24 +105,18 @@ const LEAST_WINDOW: usize = 96;
 /// Displacement in pixels of a frame's window that the search covers.
 const DISPLACED: f64 = 4.0;
 
-/// The frames to look at where frames pass for sharp, but none surely: those, and all where it is a single one.
-pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> Option<Vec<usize>> {
-    let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-    if passing.is_empty() || passing.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
+/// The frames that may be sharp, where none is surely so.
+pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> Option<Doubt> {
+    let frames: Vec<usize> = used.iter().copied().filter(|&i| sharp[i] || verdicts[i].is_alike()).collect();
+    if frames.is_empty() || frames.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
         return None;
     }
-    Some(if passing.len() > 1 { passing } else { used.to_vec() })
+    Some(Doubt { passing: frames.iter().copied().filter(|&i| sharp[i]).collect(), frames })
 }
 
-/// The frames that stay sharp of those that pass for it (`passing`), where a look at them found that `moved` did and no joint estimate is
-/// believed; `None`: none does. One alone stays: that it moved is not believed either.
-pub(super) fn settled(passing: &[usize], moved: &[usize]) -> Option<Vec<usize>> {
-    let still: Vec<usize> = passing.iter().copied().filter(|i| !moved.contains(i)).collect();
-    match (still.is_empty(), passing.len()) {
-        (false, _) => Some(still),
-        (true, 1) => Some(passing.to_vec()),
-        (true, _) => None,
-    }
+/// `frames` without those of `others`.
+fn without(frames: &[usize], others: &[usize]) -> Vec<usize> {
+    frames.iter().copied().filter(|i| !others.contains(i)).collect()
 }
 
 impl Run<'_> {
@@ -138,44 +164,83 @@ impl Run<'_> {
         Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h), channels))
     }
 
-    /// The TSFs of all of the frames `used` and a scene to start from; `None` when a merge explains them as well or, where the triage was
-    /// in doubt about the frames `doubted`, one of them hardly moved: then those of them that did. Progress runs from `from` to `to`.
-    pub(super) fn all_blurs(
-        &mut self,
-        used: &[usize],
-        doubted: Option<&[usize]>,
-        from: f32,
-        to: f32,
-    ) -> Result<(Option<Found>, Vec<usize>)> {
-        if self.settings.blind == Blind::Patches {
-            return Ok((self.patches(used, from, to)?, Vec::new()));
-        }
-        let Some(doubted) = doubted else { return Ok((self.joint(used, None, false, from, to)?, Vec::new())) };
+    /// The TSFs of all of the frames `used` and a scene to start from, unless a merge explains them as well or, where there is `doubt`, some of
+    /// them are sharp. Progress runs from `from` to `to`.
+    pub(super) fn all_blurs(&mut self, used: &[usize], doubt: Option<&Doubt>, from: f32, to: f32) -> Result<AllBlurs> {
         let at = |part: f32| from + part * (to - from);
-        let told = |seen: &Option<Seen>| seen.as_ref().map_or_else(Vec::new, |seen| seen.extents.clone());
-        let all_moved = |extents: &[f64]| !extents.is_empty() && extents.iter().all(|e| *e > SHAKEN);
-        let mut seen = self.look(doubted, from, at(0.2))?;
-        let extents = told(&seen);
-        let shaken: Vec<usize> = doubted.iter().zip(&extents).filter(|(_, e)| **e > SURELY_SHAKEN).map(|(i, _)| *i).collect();
-        let mut none_still = all_moved(&extents);
-        if !none_still && !shaken.is_empty() && doubted.len() - shaken.len() == 1 && doubted.len() < used.len() {
-            // One alone stands still beside another's motion, whatever it did itself: the others tell.
-            seen = self.look(used, at(0.2), at(0.3))?;
-            none_still = all_moved(&told(&seen));
+        let or_merged = |found: Option<Found>| found.map_or(AllBlurs::Unexplained, AllBlurs::Found);
+        if self.settings.blind == Blind::Patches {
+            return Ok(or_merged(self.patches(used, from, to)?));
         }
-        if !none_still {
-            let still: Vec<usize> = doubted.iter().copied().filter(|i| !shaken.contains(i)).collect();
-            return Ok((None, self.confirmed(shaken, &still)));
+        let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, &[], from, to)?.0)) };
+        let Doubt { frames: alike, passing } = doubt;
+        let frames = if alike.len() > 1 { alike } else { used };
+        let mut seen = self.look(frames, from, at(0.2))?;
+        if let Some(seen) = &seen {
+            if self.stood_still(seen, alike) {
+                return Ok(AllBlurs::Sharp(alike.clone()));
+            }
+            let shaken = seen.beyond(alike, SURELY_SHAKEN);
+            let still = without(alike, &shaken);
+            // One alone stands still beside another's motion, whatever it did itself.
+            let tells = still.len() > 1 || (still.len() == 1 && frames.len() == used.len());
+            if !shaken.is_empty() && tells && self.stood_still(seen, &still) {
+                return Ok(self.settled(alike, shaken));
+            }
         }
-        let look = seen.filter(|seen| seen.frames == used).and_then(|seen| seen.look);
-        let found = self.joint(used, look, true, at(0.3), to)?;
-        Ok((found, doubted.to_vec()))
+        let doubtful = !passing.is_empty();
+        if doubtful {
+            let shaken = seen.as_ref().map_or_else(Vec::new, |seen| seen.beyond(passing, SURELY_SHAKEN));
+            let still = without(passing, &shaken);
+            let mut none_still = seen.as_ref().is_some_and(Seen::all_moved);
+            if !none_still && !shaken.is_empty() && still.len() == 1 && frames.len() < used.len() {
+                // One alone stands still beside another's motion, whatever it did itself: the others tell.
+                seen = self.look(used, at(0.2), at(0.3))?;
+                none_still = match &seen {
+                    Some(seen) => seen.all_moved() && !self.stood_still(seen, &still),
+                    None => false,
+                };
+            }
+            if !none_still && (!still.is_empty() || passing.len() == 1) {
+                return Ok(self.settled(passing, shaken));
+            }
+        }
+        let look = seen.filter(|seen| seen.frames == used && seen.whole).map(|seen| seen.look);
+        let (found, still) = self.joint(used, look, passing, at(0.3), to)?;
+        if found.is_some() || !doubtful {
+            return Ok(or_merged(found));
+        }
+        let moved = without(passing, &still);
+        if moved.len() < passing.len() || passing.len() == 1 {
+            return Ok(self.settled(passing, moved));
+        }
+        self.degrade(
+            "every frame that could be sharp seems to have moved, and camera shake does not explain the frames: they are merged without \
+             deblurring, the least blurred weighted most (--sharp names frames that are sharp)"
+                .into(),
+        )?;
+        Ok(AllBlurs::Unexplained)
+    }
+
+    /// Whether the frames `still`, of those looked at, are explained as well if they did not move.
+    fn stood_still(&mut self, seen: &Seen, still: &[usize]) -> bool {
+        let places: Vec<usize> = (0..seen.frames.len()).filter(|&k| still.contains(&seen.frames[k])).collect();
+        let growth = seen.look.if_still(&places);
+        self.blind["residual_if_still"] = json!(growth);
+        growth < if places.len() > 1 { STOOD_STILL.1 } else { STOOD_STILL.0 }
+    }
+
+    /// The frames that stay sharp of those that pass for it (`passing`), of which `moved` seem to have. One alone stays: that it moved is not
+    /// believed either.
+    fn settled(&mut self, passing: &[usize], moved: Vec<usize>) -> AllBlurs {
+        let still = without(passing, &moved);
+        AllBlurs::Sharp(if still.is_empty() { passing.to_vec() } else { without(passing, &self.confirmed(moved, &still)) })
     }
 
     /// Those of the frames `moved` that are blurred beside the frames `still`, too: a coarse look at frames that all are noisy errs by some pixels
     /// now and then, and a sharp frame that counts as shaken is missed where the blurs of the others are estimated.
     fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Vec<usize> {
-        if moved.is_empty() || still.is_empty() {
+        if moved.is_empty() {
             return moved;
         }
         let sharp: Vec<bool> = (0..self.exposures.len()).map(|i| still.contains(&i)).collect();
@@ -256,9 +321,10 @@ impl Run<'_> {
         })
         .ok_or(Error::Cancelled)?;
         let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
-        let extents = look.extents();
-        self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": extents });
-        Ok(Some(Seen { extents, look: ((ww, wh) == (w, h)).then_some(look), frames: frames.to_vec() }))
+        self.blind = json!({
+            "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": look.extents(),
+        });
+        Ok(Some(Seen { frames: frames.to_vec(), look, whole: (ww, wh) == (w, h) }))
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
@@ -305,16 +371,19 @@ impl Run<'_> {
         Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference], reduced: false }))
     }
 
-    /// The joint estimate, after `look` at all of the frames where there was one.
-    fn joint(&mut self, used: &[usize], look: Option<Look>, doubtful: bool, from: f32, to: f32) -> Result<Option<Found>> {
+    /// The joint estimate, after `look` at all of the frames where there was one. Where it is `doubtful` whether all of them moved, it is believed only
+    /// if it finds that they did; otherwise those that hardly did.
+    fn joint(&mut self, used: &[usize], look: Option<Look>, doubted: &[usize], from: f32, to: f32) -> Result<(Option<Found>, Vec<usize>)> {
         let channels = self.most_telling(used, used);
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
+        let doubtful = !doubted.is_empty();
+        let places: Vec<usize> = (0..used.len()).filter(|&k| doubted.contains(&used[k])).collect();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
-        let found = blind::estimate(&frames, &starts, look, (&merged.mean_of(channels), &still), &mut |s| {
+        let found = blind::estimate(&frames, &starts, look, &places, (&merged.mean_of(channels), &still), &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
@@ -323,7 +392,8 @@ impl Run<'_> {
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
-        let believed = explained && (!doubtful || extents.iter().all(|e| *e > SHAKEN));
+        let moved: Vec<usize> = used.iter().zip(&extents).filter(|(_, e)| **e > SHAKEN).map(|(i, _)| *i).collect();
+        let believed = explained && (!doubtful || moved.len() == used.len());
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],
@@ -332,31 +402,33 @@ impl Run<'_> {
             "channels": channels.names(),
             "extent_px": extents,
             "estimated_at_scale": found.scale,
+            "residual_if_still": doubtful.then_some(found.if_still),
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
             "ways": found.ways,
         });
         if !believed && doubtful {
-            return Ok(None);
+            return Ok((None, if explained { without(used, &moved) } else { Vec::new() }));
         }
         if !believed {
             self.degrade(format!(
                 "no frame is sharp, and camera shake explains the frames no better than a merge (residuals {joint:.1} against {alone:.1} \
                  times the noise): they are merged without deblurring, the least blurred weighted most"
             ))?;
-            return Ok(None);
+            return Ok((None, Vec::new()));
         }
         // The colours as the TSFs place the frames.
         for (&i, tsf) in used.iter().zip(&found.tsfs) {
             self.motions[i] = tsf.centre();
         }
         let merged = self.blurred_merge(used);
-        Ok(Some(Found {
+        let found = Found {
             start: Self::coloured(&merged, &found.luminance, channels),
             tsfs: found.tsfs,
             reference: used[found.reference],
             reduced: found.scale > 1,
-        }))
+        };
+        Ok((Some(found), Vec::new()))
     }
 
     /// Masks by which the frame `i` alone counts.
@@ -384,20 +456,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_that_moved_are_sharp_no_more_and_one_alone_stays() {
-        assert_eq!(settled(&[0, 2], &[2]), Some(vec![0]));
-        assert_eq!(settled(&[0, 2, 3], &[]), Some(vec![0, 2, 3]));
-        assert_eq!(settled(&[0, 2], &[0, 2]), None);
-        assert_eq!(settled(&[1], &[0, 1, 2]), Some(vec![1]));
-    }
-
-    #[test]
     fn doubt_is_about_frames_without_steep_edges() {
-        let verdict = |steepness| Verdict { sharp: true, detail: 1.0, compared: true, steepness, reason: String::new() };
-        let all = [verdict(0.45), verdict(0.5), verdict(0.3)];
-        assert_eq!(doubted(&all, &[true, true, false], &[0, 1, 2]), Some(vec![0, 1]));
-        assert_eq!(doubted(&all, &[true, false, false], &[0, 1, 2]), Some(vec![0, 1, 2]), "one alone is looked at with the others");
-        assert_eq!(doubted(&[verdict(0.45), verdict(0.6)], &[true, true], &[0, 1]), None, "one is surely sharp");
-        assert_eq!(doubted(&all, &[false; 3], &[0, 1, 2]), None);
+        let verdict = |detail, steepness, sharp| Verdict { sharp, detail, compared: true, steepness, reason: String::new() };
+        let of = |all: &[Verdict], used: &[usize]| {
+            let sharp: Vec<bool> = all.iter().map(|v| v.sharp).collect();
+            doubted(all, &sharp, used).map(|d| (d.frames, d.passing))
+        };
+        let mut all = [verdict(1.0, 0.45, true), verdict(0.9, 0.5, true), verdict(0.3, 0.4, false)];
+        assert_eq!(of(&all, &[0, 1, 2]), Some((vec![0, 1], vec![0, 1])));
+        assert_eq!(of(&all, &[0, 2]), Some((vec![0], vec![0])), "frames that are left out do not count");
+        all[0] = verdict(1.0, 0.3, false);
+        assert_eq!(of(&all, &[0, 1, 2]), Some((vec![0, 1], vec![1])), "as fine as another, but softer than edges are");
+        all[1] = verdict(1.0, 0.6, true);
+        assert_eq!(of(&all, &[0, 1, 2]), None, "one is surely sharp");
+        let uncompared = Verdict { compared: false, ..verdict(1.0, 0.3, false) };
+        assert_eq!(of(&[uncompared, verdict(0.3, 0.4, false)], &[0, 1]), None, "nothing says that one is as fine as another");
     }
 }

@@ -2,6 +2,7 @@
 
 mod automatic;
 mod calibrate;
+mod displacement;
 mod file;
 mod mitsunaga;
 mod reduce;

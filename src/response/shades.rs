@@ -1,5 +1,6 @@
 //! Shades that all frames agree on however blurred they are: mean exposures of blocks whose surroundings are as bright as they.
 
+use super::displacement::displacements;
 use crate::exposure::Frame;
 use crate::mask::CLIPPED;
 use rayon::prelude::*;
@@ -15,7 +16,7 @@ const SAMPLED: usize = 1000;
 /// A block of which more than this part reads zero hides its mean: noise is cut off at black.
 const BLACK: f64 = 0.01;
 /// Shades below 4 of 255 say more about the black level than about the curve.
-const DARKEST: f64 = 4.0 / 255.0;
+pub(super) const DARKEST: f64 = 4.0 / 255.0;
 /// Blur and misalignment move a block's content by about this part of the block's side.
 const DISPLACEMENT: f64 = 0.4;
 /// Shades are told apart in so many steps of intensity, for their weights.
@@ -58,8 +59,9 @@ pub(super) fn collect(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + S
     let (width, height) = first.intensity.size();
     let reach = (width.max(height) / BLOCKS).max(LEAST_SIDE);
     // Smaller blocks see smaller objects; blur moves as many pixels into them.
+    let displaced = displacements(frames);
     let sides = [reach, reach / 2, reach / 4].into_iter().filter(|&s| s == reach || s >= LEAST_SIDE);
-    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, inverse, side, reach)).collect();
+    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, &displaced, inverse, side, reach)).collect();
     let cell = |s: &Shade| (s.channel, s.seen.iter().map(|v| (v.frame, (v.z * CELLS) as usize)).collect::<Vec<_>>());
     let mut population: HashMap<_, usize> = HashMap::new();
     for s in &shades {
@@ -78,13 +80,19 @@ pub(super) fn collect(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + S
     shades
 }
 
-/// [`collect`] of blocks of one size, without weights; blur reaches over `reach` pixels.
-fn of_size(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + Sync), side: usize, reach: usize) -> Vec<Shade> {
+/// [`collect`] of blocks of one size, without weights; each frame's are as far from their place as it is `displaced`, blur reaches over `reach` pixels.
+fn of_size(
+    frames: &[Frame],
+    displaced: &[(isize, isize)],
+    inverse: &(dyn Fn(usize, f64) -> f64 + Sync),
+    side: usize,
+    reach: usize,
+) -> Vec<Shade> {
     let (width, height) = frames[0].intensity.size();
     let (columns, rows) = (width / side, height / side);
     let jobs: Vec<(usize, usize)> = (0..3).flat_map(|c| (0..frames.len()).map(move |i| (c, i))).collect();
     let maps: Vec<Vec<Option<Seen>>> =
-        jobs.par_iter().map(|&(c, i)| means(&frames[i], i, c, side, reach, columns, rows, inverse)).collect();
+        jobs.par_iter().map(|&(c, i)| means(&frames[i], i, displaced[i], c, side, reach, columns, rows, inverse)).collect();
     let mut shades = Vec::new();
     let mut maps = maps.into_iter();
     for channel in 0..3 {
@@ -102,6 +110,7 @@ fn of_size(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + Sync), side:
 fn means(
     frame: &Frame,
     index: usize,
+    (dx, dy): (isize, isize),
     channel: usize,
     side: usize,
     reach: usize,
@@ -120,8 +129,14 @@ fn means(
         for bx in 0..columns {
             let (mut sum, mut black, mut white) = (0.0, 0usize, false);
             let mut n = 0.0;
+            let inside = |at: usize, d: isize, n: usize| (at * side).checked_add_signed(d).is_some_and(|s| s + side <= n);
+            if !(inside(bx, dx, plane.width) && inside(by, dy, plane.height)) {
+                blocks.push((0.0, true, false));
+                continue;
+            }
             for y in (by * side..(by + 1) * side).step_by(stride) {
                 for x in (bx * side..(bx + 1) * side).step_by(stride) {
+                    let (x, y) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
                     let z = plane.at(x, y);
                     n += 1.0;
                     sum += table[(z.clamp(0.0, 1.0) * STEPS as f32).round() as usize];

@@ -1,4 +1,4 @@
-//! What must not spoil a merge: a wrong TSF, another scene, something that moved, noise of any level, light beyond white.
+//! What must not spoil a merge: a wrong TSF, another scene, something that moved, noise of any level, light beyond white, a soft lens.
 
 use std::sync::OnceLock;
 use unshaken::exposure::{Bracket, Frame};
@@ -172,4 +172,23 @@ fn light_beyond_white_goes_on_smoothly() {
         }
     }
     assert!(count > 50, "the scene holds light beyond white: {count} pixels");
+}
+
+/// Hand-held frames through a soft lens: no edge is steep, and no two frames lie on the same pixels. The sharp ones are still sharp.
+#[test]
+fn a_soft_lens_is_not_taken_for_shake() {
+    let mut scene = synth::room(SIZE.0, SIZE.1, 32, 5);
+    for _ in 0..5 {
+        scene.samples = scene.samples.map_planes(|p| p.box_sum(2).map(|v| v / 25.0));
+    }
+    let displaced = Tremor { extent_px: 0.0, roll_deg: 0.0, offset_px: 6.0, offset_deg: 0.2 };
+    let shaken = Tremor { extent_px: 8.0, roll_deg: 0.8, ..displaced };
+    let frames = [(1.0 / 30.0, None), (1.0 / 8.0, Some(displaced)), (1.0, Some(shaken))];
+    let made = synth::capture(&scene, &Camera::default(), &frames, 0.15, 5).unwrap();
+    let found = merge(&made.bracket, &settings(), None);
+    let sharp: Vec<bool> = (0..3).map(|i| found.report["frames"][i]["sharp"].as_bool().unwrap()).collect();
+    println!("{sharp:?} {} {}", found.report["blind"], found.report["frames"]);
+    assert_eq!(sharp, [true, true, false], "{}", found.report["blind"]);
+    assert!(found.report["blind"]["residual_if_still"].as_f64().is_some(), "there was a doubt: {}", found.report["blind"]);
+    assert!(found.left_out.is_empty(), "{:?}", found.left_out);
 }

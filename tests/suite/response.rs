@@ -230,6 +230,26 @@ fn a_wrong_exposure_time_is_named_with_its_error() {
     }
 }
 
+/// Hand-held frames differ by tens of pixels; blocks are compared where the scene lies.
+#[test]
+fn displaced_frames_give_the_curve_and_raise_no_alarm() {
+    let whole = shaken_bracket();
+    let frames = whole.frames().iter().zip([(24, 18), (6, 27), (38, 4), (20, 34)]).map(|(f, (x, y))| {
+        let intensity = f.intensity.map_planes(|p| p.crop(x, y, 192, 144));
+        Frame { intensity, ..f.clone() }
+    });
+    let bracket = Bracket::new(frames.collect()).unwrap();
+    let check = check_exposures(&bracket, &film_response());
+    assert!(check.suspects().is_empty(), "{check:.3?}");
+    assert!(check.difference_ev.iter().all(|d| d.is_some_and(|d| d.abs() < 0.15)), "{check:.3?}");
+    let found = automatic(&bracket).unwrap();
+    assert!(found.exposures.suspects().is_empty(), "{:.3?}", found.exposures);
+    let truth = true_ln_table(film);
+    let worst = (0..3).map(|c| difference(&ln_table(&found.response, c), &truth, 20, 235)).fold(0.0, f64::max);
+    println!("{worst:.3}, {:.3?}", check.difference_ev);
+    assert!(worst < 0.2, "{worst:.3}");
+}
+
 #[test]
 fn few_shades_give_a_gamma_and_say_so() {
     // Eleven patches of 8 x 8 px in three channels, through a gamma of 1.8.
