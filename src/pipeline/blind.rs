@@ -91,6 +91,8 @@ const SHAKEN: f64 = 1.5;
 /// Growth of the residuals, if a frame alone or several did not move, up to which they did not: sharp frames in place and displaced measure up to 1.3
 /// and 1.5, frames blurred by 4 px and more from 1.7 and 2.9 on.
 const STOOD_STILL: (f64, f64) = (1.5, 2.0);
+/// Growth at the look above which the frames as they are, which tell more, need not be asked.
+const CLEAR: f64 = 5.0;
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
 /// measure up to 1.6.
 const SURELY_SHAKEN: f64 = 3.0;
@@ -112,6 +114,11 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
         return None;
     }
     Some(Doubt { passing: frames.iter().copied().filter(|&i| sharp[i]).collect(), frames })
+}
+
+/// Whether `count` frames stood still, if residuals grow so much when they are held.
+fn stands(growth: f64, count: usize) -> bool {
+    growth < if count > 1 { STOOD_STILL.1 } else { STOOD_STILL.0 }
 }
 
 /// `frames` without those of `others`.
@@ -172,19 +179,21 @@ impl Run<'_> {
         if self.settings.blind == Blind::Patches {
             return Ok(or_merged(self.patches(used, from, to)?));
         }
-        let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, &[], from, to)?.0)) };
+        let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, false, &[], from, to)?.0)) };
         let Doubt { frames: alike, passing } = doubt;
         let frames = if alike.len() > 1 { alike } else { used };
         let mut seen = self.look(frames, from, at(0.2))?;
+        let mut growth = 0.0;
         if let Some(seen) = &seen {
-            if self.stood_still(seen, alike) {
+            growth = self.if_still(seen, alike);
+            if stands(growth, alike.len()) {
                 return Ok(AllBlurs::Sharp(alike.clone()));
             }
             let shaken = seen.beyond(alike, SURELY_SHAKEN);
             let still = without(alike, &shaken);
             // One alone stands still beside another's motion, whatever it did itself.
             let tells = still.len() > 1 || (still.len() == 1 && frames.len() == used.len());
-            if !shaken.is_empty() && tells && self.stood_still(seen, &still) {
+            if !shaken.is_empty() && tells && stands(self.if_still(seen, &still), still.len()) {
                 return Ok(self.settled(alike, shaken));
             }
         }
@@ -197,7 +206,7 @@ impl Run<'_> {
                 // One alone stands still beside another's motion, whatever it did itself: the others tell.
                 seen = self.look(used, at(0.2), at(0.3))?;
                 none_still = match &seen {
-                    Some(seen) => seen.all_moved() && !self.stood_still(seen, &still),
+                    Some(seen) => seen.all_moved() && !stands(self.if_still(seen, &still), still.len()),
                     None => false,
                 };
             }
@@ -206,7 +215,8 @@ impl Run<'_> {
             }
         }
         let look = seen.filter(|seen| seen.frames == used && seen.whole).map(|seen| seen.look);
-        let (found, still) = self.joint(used, look, passing, at(0.3), to)?;
+        let asked = if doubtful && growth < CLEAR { &passing[..] } else { &[] };
+        let (found, still) = self.joint(used, look, doubtful, asked, at(0.3), to)?;
         if found.is_some() || !doubtful {
             return Ok(or_merged(found));
         }
@@ -222,12 +232,12 @@ impl Run<'_> {
         Ok(AllBlurs::Unexplained)
     }
 
-    /// Whether the frames `still`, of those looked at, are explained as well if they did not move.
-    fn stood_still(&mut self, seen: &Seen, still: &[usize]) -> bool {
+    /// By how much the residuals of all frames looked at grow if the frames `still` of them did not move.
+    fn if_still(&mut self, seen: &Seen, still: &[usize]) -> f64 {
         let places: Vec<usize> = (0..seen.frames.len()).filter(|&k| still.contains(&seen.frames[k])).collect();
         let growth = seen.look.if_still(&places);
         self.blind["residual_if_still"] = json!(growth);
-        growth < if places.len() > 1 { STOOD_STILL.1 } else { STOOD_STILL.0 }
+        growth
     }
 
     /// The frames that stay sharp of those that pass for it (`passing`), of which `moved` seem to have. One alone stays: that it moved is not
@@ -371,15 +381,22 @@ impl Run<'_> {
         Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference], reduced: false }))
     }
 
-    /// The joint estimate, after `look` at all of the frames where there was one. Where it is `doubtful` whether all of them moved, it is believed only
-    /// if it finds that they did; otherwise those that hardly did.
-    fn joint(&mut self, used: &[usize], look: Option<Look>, doubted: &[usize], from: f32, to: f32) -> Result<(Option<Found>, Vec<usize>)> {
+    /// The joint estimate, after `look` at all of the frames where there was one. Where it is `doubtful` whether all moved, it is believed only if it
+    /// finds that they did, and that those `asked` about are not explained as well if they did not; otherwise the frames that hardly moved.
+    fn joint(
+        &mut self,
+        used: &[usize],
+        look: Option<Look>,
+        doubtful: bool,
+        asked: &[usize],
+        from: f32,
+        to: f32,
+    ) -> Result<(Option<Found>, Vec<usize>)> {
         let channels = self.most_telling(used, used);
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
-        let doubtful = !doubted.is_empty();
-        let places: Vec<usize> = (0..used.len()).filter(|&k| doubted.contains(&used[k])).collect();
+        let places: Vec<usize> = (0..used.len()).filter(|&k| asked.contains(&used[k])).collect();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
@@ -393,7 +410,9 @@ impl Run<'_> {
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
         let moved: Vec<usize> = used.iter().zip(&extents).filter(|(_, e)| **e > SHAKEN).map(|(i, _)| *i).collect();
-        let believed = explained && (!doubtful || moved.len() == used.len());
+        // The frames as they are tell more than a look at half their size.
+        let stood_still = !places.is_empty() && stands(found.if_still, places.len());
+        let believed = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],
@@ -402,13 +421,14 @@ impl Run<'_> {
             "channels": channels.names(),
             "extent_px": extents,
             "estimated_at_scale": found.scale,
-            "residual_if_still": doubtful.then_some(found.if_still),
+            "residual_if_still": (!places.is_empty()).then_some(found.if_still),
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
             "ways": found.ways,
         });
         if !believed && doubtful {
-            return Ok((None, if explained { without(used, &moved) } else { Vec::new() }));
+            let still = if stood_still { asked.to_vec() } else { without(used, &moved) };
+            return Ok((None, if explained || stood_still { still } else { Vec::new() }));
         }
         if !believed {
             self.degrade(format!(

@@ -159,11 +159,12 @@ fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
     let merged = mean(&frames);
     let found =
-        blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], None, &[], (&merged, &still()), &mut |_| true)
+        blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], None, &[0, 1], (&merged, &still()), &mut |_| true)
             .unwrap();
     for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
         assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
     }
+    assert!(found.if_still < 1.5, "held still they are explained as well: {}", found.if_still);
 }
 
 /// A frame of more than 250 px has a second level, whose held-out pixels tell whether drawn scenes help.
@@ -173,7 +174,7 @@ fn the_way_with_the_least_residual_at_the_second_level_goes_on() {
     let frames = frames_of(size, &tiles(size.0 + 2 * PAD, size.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = Stage { scale: 2, fraction: 0.0 };
-    let found = blind::estimate(&frames, &starts, None, &[], (&frames[1].blurred, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, None, &[0, 1], (&frames[1].blurred, &still()), &mut |s| {
         assert!(s.fraction > last.fraction && s.scale <= last.scale, "progress goes on: {last:?} to {s:?}");
         last = s;
         true
@@ -185,6 +186,7 @@ fn the_way_with_the_least_residual_at_the_second_level_goes_on() {
     // The second level is the last one here.
     let end = blind::geometric_mean(&found.held_out);
     assert!((end - found.ways[0].held_out).abs() < 1e-9 * end, "{:?} and in the end {end}", found.ways);
+    assert!(found.if_still > 3.0, "held still they are not explained: {}", found.if_still);
     assert!(end < 0.25 * blind::geometric_mean(&found.held_out_merge), "{end}, the merge {:?}", found.held_out_merge);
 }
 
