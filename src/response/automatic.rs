@@ -2,6 +2,7 @@
 
 use super::Response;
 use super::calibrate::make_monotone;
+use super::displacement::displacements;
 use super::shades::{self, Shade};
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
@@ -90,11 +91,12 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
             frames[0].name
         ))
     };
+    let displaced = displacements(frames);
     let mut curves = Curves::gamma(2.2);
     let mut chosen = None;
     // Means of exposures need the curve: begin with a gamma, then with the curve itself.
     for _ in 0..2 {
-        let shades = shades::collect(frames, &|c, z| curves.inverse(c, z));
+        let shades = shades::collect(frames, &displaced, &|c, z| curves.inverse(c, z));
         let telling = shades.iter().filter(|s| tells_ratio(s, &times)).count();
         if telling < FEWEST {
             return Err(refuse(format!("only {telling} of their blocks are well exposed in two frames of different exposure time")));
@@ -106,7 +108,7 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
         chosen = Some((fit, telling));
     }
     let (fit, telling) = chosen.expect("two rounds ran");
-    let shades = shades::collect(frames, &|c, z| curves.inverse(c, z));
+    let shades = shades::collect(frames, &displaced, &|c, z| curves.inverse(c, z));
     let exposures = Problem { shades: &shades, times: &times, held: false }.check(fit.curves.shape, None);
     // With times that are wrong, the curve that held to them is wrong too.
     let fit = if exposures.suspects().is_empty() {
@@ -136,7 +138,7 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
 pub fn check_exposures(bracket: &Bracket, response: &Response) -> ExposureCheck {
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
-    let shades = shades::collect(frames, &|c, z| response.inverse(c, z));
+    let shades = shades::collect(frames, &displacements(frames), &|c, z| response.inverse(c, z));
     Problem { shades: &shades, times: &times, held: false }.check(Shape { powers: 0, shared: true }, Some(response))
 }
 

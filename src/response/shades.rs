@@ -1,6 +1,5 @@
 //! Shades that all frames agree on however blurred they are: mean exposures of blocks whose surroundings are as bright as they.
 
-use super::displacement::displacements;
 use crate::exposure::Frame;
 use crate::mask::CLIPPED;
 use rayon::prelude::*;
@@ -52,16 +51,17 @@ pub(super) struct Seen {
 
 /// Blocks of `frames` that at least two frames show neither clipped nor black, averaged in exposures under f⁻¹ = `inverse`(channel, z).
 ///
+/// `displaced`: the frames' [`displacements`](super::displacement::displacements), where blocks are compared.
+///
 /// Blur averages exposures; so a block's mean *exposure* survives it where the neighbouring blocks are as bright, whatever
 /// texture is inside. Where they are not, the difference to the neighbours becomes the uncertainty `Seen::deviation`.
-pub(super) fn collect(frames: &[Frame], inverse: &(dyn Fn(usize, f64) -> f64 + Sync)) -> Vec<Shade> {
+pub(super) fn collect(frames: &[Frame], displaced: &[(isize, isize)], inverse: &(dyn Fn(usize, f64) -> f64 + Sync)) -> Vec<Shade> {
     let Some(first) = frames.first() else { return Vec::new() };
     let (width, height) = first.intensity.size();
     let reach = (width.max(height) / BLOCKS).max(LEAST_SIDE);
     // Smaller blocks see smaller objects; blur moves as many pixels into them.
-    let displaced = displacements(frames);
     let sides = [reach, reach / 2, reach / 4].into_iter().filter(|&s| s == reach || s >= LEAST_SIDE);
-    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, &displaced, inverse, side, reach)).collect();
+    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, displaced, inverse, side, reach)).collect();
     let cell = |s: &Shade| (s.channel, s.seen.iter().map(|v| (v.frame, (v.z * CELLS) as usize)).collect::<Vec<_>>());
     let mut population: HashMap<_, usize> = HashMap::new();
     for s in &shades {
