@@ -212,6 +212,8 @@ struct Run<'a> {
     events: &'a mut dyn FnMut(Event) -> bool,
     timings: Vec<(String, f64)>,
     blind: Value,
+    /// What each displaced sharp frame shows of structure finer than the latent grid, taken off its exposure; none before it is known.
+    aliasing: Vec<Option<Rgb>>,
     /// Exposure time of the reference frame, once it is chosen.
     scale: f64,
 }
@@ -281,6 +283,7 @@ pub fn merge_with(
         events,
         timings: Vec::new(),
         blind: Value::Null,
+        aliasing: vec![None; frames.len()],
         scale: 1.0,
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
@@ -618,6 +621,9 @@ impl Run<'_> {
                     tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
+            if round + 1 == rounds {
+                self.find_aliasing(&still, &shaken, &latent, at(0.1), at(0.3))?;
+            }
             let moving: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
             let pad = deblur::pad_for(&moving, w, h, limit);
             let from = match solution.as_ref().or(base.as_ref()) {
@@ -637,7 +643,9 @@ impl Run<'_> {
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
             let judge = |&i: &usize| Some((i, self.unexplained(i, misfit(i)?, &start)?));
-            let hopeless: Vec<(usize, f64)> = shaken.iter().filter_map(judge).collect();
+            // TSFs of a smaller size err by pixels of the frame's: they are judged once they have been refined.
+            let rough = reduced && round + 1 < rounds;
+            let hopeless: Vec<(usize, f64)> = shaken.iter().filter(|_| !rough).filter_map(judge).collect();
             if hopeless.is_empty() {
                 latent = solved.cropped();
                 solution = Some(solved);
@@ -653,9 +661,12 @@ impl Run<'_> {
             }
             solution = None;
         }
+        if shaken.is_empty() && !unexplained {
+            self.find_aliasing(&still, &shaken, &latent, 0.80, 0.90)?;
+        }
         let solution = match (solution, base) {
             (Some(found), _) => found,
-            (None, Some(base)) if shaken.is_empty() && first == alone => base,
+            (None, Some(base)) if first == alone && self.aliasing.iter().all(Option::is_none) => base,
             // No shaken frame is left: the sharp ones alone, as the user wants them, from what they were for the estimates.
             (None, base) => {
                 let from = base.map_or(initial, |found| found.irradiance);
@@ -713,15 +724,53 @@ impl Run<'_> {
     fn observation(&self, i: usize, tsf: Tsf) -> Observation {
         let frame = &self.bracket.frames()[i];
         let unclipped = |x: f32, z: f32| if z < mask::CLIPPED { x } else { UNSEEN };
-        let exposure = std::array::from_fn(|c| self.exposures[i].0[c].zip(&frame.intensity.0[c], unclipped));
+        let mut exposure = Rgb(std::array::from_fn(|c| self.exposures[i].0[c].zip(&frame.intensity.0[c], unclipped)));
+        if let Some(finer) = &self.aliasing[i] {
+            for (e, f) in exposure.0.iter_mut().zip(&finer.0) {
+                *e = e.zip(f, |e, f| if e == UNSEEN { e } else { e - f });
+            }
+        }
         Observation {
-            exposure: Rgb(exposure),
+            exposure,
             mask: self.counting(i),
             exposure_time: frame.exposure_time,
             noise: self.curves[i].clone(),
             black_clipped: true,
             tsf,
         }
+    }
+
+    /// What the displaced ones of the sharp frames `still` show of structure finer than the latent grid, unless that is known. `latent`: irradiance as it
+    /// is known. Progress runs from `from` to `to`.
+    fn find_aliasing(&mut self, still: &[usize], shaken: &[usize], latent: &Rgb, from: f32, to: f32) -> Result<()> {
+        let displaced = still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+        if still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some) {
+            return Ok(());
+        }
+        let (w, h) = self.bracket.size();
+        let settings = for_estimates(&self.settings.deblur);
+        let bytes = |found: &Vec<Option<Rgb>>| found.iter().flatten().map(|f| 12 * f.width() * f.height()).sum();
+        let found = self.remembered("aliasing", &format!("{shaken:?} {settings:?}"), bytes, |run| {
+            let observations: Vec<Observation> = still.iter().map(|&i| run.observation(i, Tsf::still(run.motions[i]))).collect();
+            let tsfs: Vec<&Tsf> = observations.iter().map(|o| &o.tsf).collect();
+            let pad = deblur::pad_for(&tsfs, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
+            let start = run.surrounded(latent, 0, pad, still, shaken);
+            let mut hear = |f: f32| {
+                (run.events)(Event::Progress {
+                    stage: "looking between the pixels of displaced frames".into(),
+                    fraction: from + (to - from) * f,
+                })
+            };
+            match deblur::aliasing(run.gpu, run.kernels, &observations, &start, pad, &settings, deblur::TILE, &mut hear) {
+                // The result is what it would be without.
+                Err(Error::OutOfMemory(_) | Error::Adapter(_)) => Ok(vec![None; still.len()]),
+                found => found,
+            }
+        })?;
+        for (&i, found) in still.iter().zip(found) {
+            self.aliasing[i] = found;
+        }
+        Ok(())
     }
 
     /// Exposures and masks of the frames `ids` as registration places them, on the reference's grid plus `pad` pixels on every side; of
@@ -971,6 +1020,7 @@ impl Run<'_> {
                     "triage": verdicts[i],
                     "registration": self.registrations[i],
                     "chi_squared": position.map(|p| solution.report.chi_squared[p]),
+                    "aliasing_rms": self.aliasing[i].as_ref().map(root_mean_square),
                     "blur": details[i],
                     "tsf": tsfs[i].as_ref().map(|t| TsfEntry::new(&frames[i].name, w, h, t)),
                 })
@@ -1002,6 +1052,12 @@ impl Run<'_> {
         let Self { left_out, degraded, .. } = self;
         Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }
+}
+
+/// Over all values of all channels.
+fn root_mean_square(image: &Rgb) -> f64 {
+    let squares = image.0.iter().flat_map(|p| &p.data).map(|v| f64::from(v * v));
+    (squares.sum::<f64>() / (3 * image.width() * image.height()) as f64).sqrt()
 }
 
 /// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.

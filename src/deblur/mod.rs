@@ -18,9 +18,11 @@
 //! an outer step lowers the objective by less than `settled` of it. The iteration stops when a step under these weights lowers
 //! it by less than `tolerance` of it, or at `outer` steps.
 
+mod aliasing;
 mod memory;
 mod prior;
 
+pub use aliasing::{TILE, aliasing};
 pub use memory::Memory;
 pub use prior::Prior;
 

@@ -8,6 +8,8 @@ mod support;
 
 /// K, Kᵀ and the taps of a TSF.
 mod adjoint;
+/// What displaced frames show of structure finer than the latent grid.
+mod aliasing;
 /// The plain merge on frames whose irradiance is known.
 mod baseline;
 /// Many photographs: grouping, shards, resuming; configuration, voices, interruption.

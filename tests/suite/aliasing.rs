@@ -1,0 +1,176 @@
+//! What displaced sharp frames show of structure finer than the latent grid: against the frames that a scene four times as fine gives.
+
+use crate::oracle::blur;
+use crate::support::gpu::{gpu, kernels};
+use crate::support::{f64s, noise};
+use glam::DVec2;
+use unshaken::deblur::{Observation, Settings, TILE, aliasing};
+use unshaken::image::{Plane, Rgb};
+use unshaken::kernels::{NOISE_STEPS, STILL};
+use unshaken::metrics::{self, Judge};
+use unshaken::noise::NoiseModel;
+use unshaken::pipeline;
+use unshaken::pose::Pose;
+use unshaken::response::Response;
+use unshaken::synth::{self, Camera, Drawn, Motion, Scene};
+use unshaken::tsf::{TapSet, Tsf};
+
+const SIZE: (usize, usize) = (112, 80);
+/// Standard deviation of the exposures: eight bits' worth.
+const NOISE: f32 = 2e-3;
+/// The exposures of all frames.
+const TIME: f64 = 0.5;
+
+fn scaled(image: &Rgb, gain: f32) -> Rgb {
+    image.map_planes(|p| p.map(|v| v * gain))
+}
+
+/// A frame of `irradiance` with its noise; what is beyond white is masked.
+fn observe(irradiance: &Rgb, tsf: Tsf, seed: u64) -> Observation {
+    let exposure = Rgb(std::array::from_fn(|c| {
+        let n = noise(seed + c as u64, SIZE.0 * SIZE.1);
+        let seen = irradiance.0[c].data.iter().zip(n).map(|(v, n)| (v * TIME as f32 + 3f32.sqrt() * NOISE * n).clamp(0.0, 1.0));
+        Plane::from_vec(SIZE.0, SIZE.1, seen.collect()).unwrap()
+    }));
+    let mask = Plane::from_fn(SIZE.0, SIZE.1, |x, y| if exposure.0.iter().all(|p| p.at(x, y) < 0.97) { 1.0 } else { 0.0 });
+    let noise = std::array::from_fn(|_| vec![NOISE; NOISE_STEPS]);
+    Observation { exposure, mask, exposure_time: TIME, noise, black_clipped: false, tsf }
+}
+
+fn place(t_x: f64, t_y: f64, theta_z_deg: f64) -> Tsf {
+    let pose = Pose::planar(t_x, t_y, theta_z_deg, 1.0);
+    Tsf::still(pose.homography(Tsf::identity().focal_px))
+}
+
+/// A frame in place, two displaced ones and a shaken one; and what the displaced ones show beyond the truth's own interpolation, by the oracle's K.
+fn bracket(scene: &Scene) -> (Vec<Observation>, Vec<Plane>) {
+    let still = synth::expose(scene, &Tsf::identity());
+    let mut levels = still.mean().data;
+    levels.sort_by(f32::total_cmp);
+    let gain = 0.6 / levels[levels.len() * 95 / 100];
+    let truth = scaled(&still, gain);
+    let places = [place(3.4, -5.3, 0.5), place(-7.7, 2.45, -0.4)];
+    let shaken = Tsf::new(1000.0, vec![Pose::planar(-1.0, 0.0, 0.0, 0.5), Pose::planar(1.0, 0.0, 0.0, 0.5)]).unwrap();
+    let seen = |tsf: &Tsf| scaled(&synth::expose(scene, tsf), gain);
+    let beyond = |tsf: &Tsf| {
+        let matrix = blur::of_taps(&TapSet::new(tsf, SIZE.0, SIZE.1, STILL), STILL, SIZE, 0);
+        let made = matrix.apply(&f64s(&truth.0[1].data));
+        let shown = seen(tsf);
+        Plane { data: shown.0[1].data.iter().zip(made).map(|(s, m)| ((f64::from(*s) - m) * TIME) as f32).collect(), ..shown.0[1].clone() }
+    };
+    let wanted = places.iter().map(beyond).collect();
+    let mut frames = vec![observe(&truth, Tsf::identity(), 1)];
+    frames.extend(places.iter().zip([10, 20]).map(|(t, seed)| observe(&seen(t), t.clone(), seed)));
+    frames.push(observe(&seen(&shaken), shaken, 30));
+    (frames, wanted)
+}
+
+/// Where a displaced frame shows what the frame in place does, 12 px from the border, and light that the latter records.
+fn judged(frame: &Observation) -> Vec<bool> {
+    let back = frame.tsf.single().unwrap().inverse();
+    let half = 0.5 * DVec2::new(SIZE.0 as f64 - 1.0, SIZE.1 as f64 - 1.0);
+    let unmasked = |x: usize, y: usize| (0..9).all(|k| frame.mask.clamped(x as isize + k % 3 - 1, y as isize + k / 3 - 1) > 0.0);
+    let one = |k: usize| {
+        let (x, y) = (k % SIZE.0, k / SIZE.0);
+        let at = blur::transform(&back, DVec2::new(x as f64, y as f64) - half).abs() - half;
+        at.max_element() < -12.0 && unmasked(x, y)
+    };
+    (0..SIZE.0 * SIZE.1).map(one).collect()
+}
+
+fn rms(of: impl Iterator<Item = f32>) -> f64 {
+    let (sum, count) = of.fold((0.0, 0usize), |(s, n), v| (s + f64::from(v * v), n + 1));
+    (sum / count as f64).sqrt()
+}
+
+fn find(frames: &[Observation], tile: usize) -> Vec<Option<Rgb>> {
+    let start = frames[0].exposure.map_planes(|p| p.map(|v| (v / TIME as f32).max(1e-3)));
+    aliasing(gpu(), kernels(), frames, &start, 0, &Settings::default(), tile, &mut |_| true).unwrap()
+}
+
+#[test]
+fn what_lies_between_the_pixels_is_found_from_displaced_frames() {
+    let (frames, wanted) = bracket(&Drawn::Chart.draw(SIZE.0, SIZE.1, 24, 4, 3));
+    let found = find(&frames, TILE);
+    assert!(found[0].is_none() && found[3].is_none(), "frames in place and shaken ones show nothing that is asked for");
+    for ((frame, wanted), found) in frames[1..].iter().zip(&wanted).zip(&found[1..]) {
+        let (judged, found) = (judged(frame), &found.as_ref().unwrap().0[1]);
+        let over = |f: &dyn Fn(usize) -> f32| rms((0..judged.len()).filter(|&p| judged[p]).map(f));
+        let (before, after) = (over(&|p| wanted.data[p]), over(&|p| wanted.data[p] - found.data[p]));
+        println!("{before:.5} {after:.5}");
+        assert!(before > 3.0 * f64::from(NOISE), "the scene is harder than its pixels: {before}");
+        assert!(after < 0.6 * before, "{after} is left of {before}");
+    }
+}
+
+/// Half a pixel too far, and there would be differences everywhere.
+#[test]
+fn nothing_lies_between_the_pixels_of_a_smooth_scene() {
+    let wave = |c: usize, x: f32, y: f32| 0.5 + 0.2 * (0.17 * x + c as f32).sin() + 0.2 * (0.11 * x - 0.19 * y).cos();
+    let scene = Scene {
+        samples: Rgb(std::array::from_fn(|c| {
+            Plane::from_fn(4 * (SIZE.0 + 48), 4 * (SIZE.1 + 48), |x, y| wave(c, x as f32 / 4.0, y as f32 / 4.0))
+        })),
+        margin: 24,
+        oversampling: 4,
+    };
+    let (frames, wanted) = bracket(&scene);
+    for ((frame, wanted), found) in frames[1..].iter().zip(&wanted).zip(&find(&frames, TILE)[1..]) {
+        let (judged, found) = (judged(frame), &found.as_ref().unwrap().0[1]);
+        let inside = |p: &Plane| rms((0..judged.len()).filter(|&k| judged[k]).map(|k| p.data[k]));
+        println!("{:.6} {:.6}", inside(wanted), inside(found));
+        assert!(inside(wanted) < 0.2 * f64::from(NOISE) && inside(found) < 0.8 * f64::from(NOISE), "{} {}", inside(wanted), inside(found));
+    }
+}
+
+#[test]
+fn squares_of_any_size_give_the_same() {
+    let (frames, _) = bracket(&Drawn::Chart.draw(SIZE.0, SIZE.1, 24, 4, 3));
+    let (whole, parts) = (find(&frames, TILE), find(&frames, 48));
+    for (whole, parts) in whole.iter().zip(&parts) {
+        let (Some(whole), Some(parts)) = (whole, parts) else { continue };
+        for (w, p) in whole.0.iter().zip(&parts.0) {
+            let (all, apart) = (rms(w.data.iter().copied()), rms(w.zip(p, |a, b| a - b).data.into_iter()));
+            println!("{all:.5} {apart:.5}");
+            assert!(all > f64::from(NOISE) && apart < 0.1 * all, "{apart} of {all}");
+        }
+    }
+}
+
+/// The whole program: sharp frames off each other's pixels, before edges harder than those.
+#[test]
+fn displaced_frames_of_hard_edges_agree() {
+    let scene = Drawn::Chart.draw(SIZE.0, SIZE.1, 24, 4, 3);
+    let still = Motion::new(synth::identity(SIZE.0), false);
+    let frames =
+        [(1.0 / 30.0, still.clone()), (1.0 / 8.0, still.clone().displaced(3.4, -5.3, 0.5)), (0.5, still.displaced(-7.7, 2.45, -0.4))];
+    let made = synth::photograph(&scene, &Camera::default(), &frames, 0.15, 3, false).unwrap().0;
+    let settings = pipeline::Settings {
+        reference: Some(0),
+        sharp: Some(vec![0, 1, 2]),
+        noise: Some(NoiseModel::from_electrons(4000.0, 8.0)),
+        ..pipeline::Settings::default()
+    };
+    let found = pipeline::merge(&made.bracket, &Response::Srgb, &settings, None, &mut |_| true).unwrap();
+    let irradiance = scaled(&found.irradiance, 30.0);
+    let judge = Judge { limit: Some(0.98 * 30.0), ..Judge::default() };
+    let score = metrics::score(&irradiance, &made.truth, &judge).unwrap().pu_psnr;
+    let rms: Vec<Option<f64>> = (0..3).map(|i| found.report["frames"][i]["aliasing_rms"].as_f64()).collect();
+    println!("{score:.2} {rms:?}");
+    assert!(rms[0].is_none() && rms[1..].iter().all(|r| r.is_some_and(|r| r > 1e-3)), "{rms:?}");
+    assert!(score > 36.0, "34.1 without: {score}");
+}
+
+#[test]
+fn looking_between_the_pixels_can_be_cancelled() {
+    let (frames, _) = bracket(&Drawn::Chart.draw(SIZE.0, SIZE.1, 24, 4, 3));
+    let start = frames[0].exposure.map_planes(|p| p.map(|v| v.max(1e-3)));
+    let mut heard = 0;
+    let mut stop = |f: f32| {
+        heard += 1;
+        assert!((0.0..=1.0).contains(&f), "{f}");
+        heard < 3
+    };
+    let found = aliasing(gpu(), kernels(), &frames, &start, 0, &Settings::default(), 48, &mut stop);
+    assert!(matches!(found, Err(unshaken::error::Error::Cancelled)));
+}
