@@ -83,7 +83,7 @@ fn doubled(motion: &DMat3) -> Tsf {
 
 /// `plane` on a grid twice as fine: bilinear, the means of four are about the pixels.
 fn finer(plane: &Plane) -> Plane {
-    let side = |v: usize| if v % 2 == 0 { -1 } else { 1 };
+    let side = |v: usize| if v.is_multiple_of(2) { -1 } else { 1 };
     Plane::from_fn(2 * plane.width, 2 * plane.height, |x, y| {
         let (i, j, a, b) = ((x / 2) as isize, (y / 2) as isize, side(x), side(y));
         let at = |a: isize, b: isize| plane.clamped(i + a, j + b);
@@ -143,7 +143,10 @@ impl Fine {
         let twice = |p: &Plane, f: fn(&Plane, usize, usize) -> f32| Plane::from_fn(2 * p.width, 2 * p.height, |x, y| f(p, x, y));
         let seen = |((o, _), (shift, motion)): (&(&Observation, DMat3), &(DVec2, DMat3))| Observation {
             exposure: o.exposure.map_planes(|p| twice(&window.cut(p, *shift, 0, None), |p, x, y| p.at(x / 2, y / 2))),
-            mask: twice(&window.cut(&o.mask, *shift, 0, Some(0.0)), |p, x, y| if (x | y) % 2 == 0 { p.at(x / 2, y / 2) } else { 0.0 }),
+            mask: twice(
+                &window.cut(&o.mask, *shift, 0, Some(0.0)),
+                |p, x, y| if (x | y).is_multiple_of(2) { p.at(x / 2, y / 2) } else { 0.0 },
+            ),
             exposure_time: o.exposure_time,
             noise: o.noise.clone(),
             black_clipped: o.black_clipped,
