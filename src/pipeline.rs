@@ -56,6 +56,8 @@ pub struct Settings {
     pub noise: Option<NoiseModel>,
     /// What to do when no frame is sharp.
     pub blind: Blind,
+    /// Whether what displaced sharp frames show of structure finer than the pixels is looked for ([`deblur::aliasing`]).
+    pub between_pixels: bool,
     /// The solver's settings.
     pub deblur: deblur::Settings,
 }
@@ -74,13 +76,14 @@ impl Default for Settings {
             psf_radius: None,
             noise: None,
             blind: Blind::default(),
+            between_pixels: true,
             deblur: deblur::Settings::default(),
         }
     }
 }
 
 impl Settings {
-    /// The same for frames whose sides are divided by `divisor`: lengths in pixels shrink with them.
+    /// The same for frames whose sides are divided by `divisor`: lengths in pixels shrink with them, and a smaller size is to be quick.
     #[must_use]
     pub fn reduced(&self, divisor: usize) -> Self {
         let squares = (divisor * divisor) as f64;
@@ -90,6 +93,7 @@ impl Settings {
             psf_radius: self.psf_radius.map(|r| r.div_ceil(divisor)),
             // Means of squares of pixels have less noise than the pixels.
             noise: self.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares }),
+            between_pixels: self.between_pixels && divisor == 1,
             ..self.clone()
         }
     }
@@ -744,7 +748,7 @@ impl Run<'_> {
     /// is known. Progress runs from `from` to `to`.
     fn find_aliasing(&mut self, still: &[usize], shaken: &[usize], latent: &Rgb, from: f32, to: f32) -> Result<()> {
         let displaced = still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
-        if still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some) {
+        if !self.settings.between_pixels || still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some) {
             return Ok(());
         }
         let (w, h) = self.bracket.size();
@@ -762,8 +766,12 @@ impl Run<'_> {
                 })
             };
             match deblur::aliasing(run.gpu, run.kernels, &observations, &start, pad, &settings, deblur::TILE, &mut hear) {
-                // The result is what it would be without.
-                Err(Error::OutOfMemory(_) | Error::Adapter(_)) => Ok(vec![None; still.len()]),
+                Err(Error::OutOfMemory(_) | Error::Adapter(_)) => {
+                    run.warn(
+                        "the GPU's memory is too short to look between the pixels of displaced frames: hard edges come out softer".into(),
+                    )?;
+                    Ok(vec![None; still.len()])
+                }
                 found => found,
             }
         })?;

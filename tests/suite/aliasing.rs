@@ -157,6 +157,7 @@ fn displaced_frames_of_hard_edges_agree() {
     let score = metrics::score(&irradiance, &made.truth, &judge).unwrap().pu_psnr;
     let rms: Vec<Option<f64>> = (0..3).map(|i| found.report["frames"][i]["aliasing_rms"].as_f64()).collect();
     println!("{score:.2} {rms:?}");
+    assert!(settings.reduced(1).between_pixels && !settings.reduced(2).between_pixels, "a quick look does without");
     assert!(rms[0].is_none() && rms[1..].iter().all(|r| r.is_some_and(|r| r > 1e-3)), "{rms:?}");
     assert!(score > 36.0, "34.1 without: {score}");
 }
