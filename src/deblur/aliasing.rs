@@ -19,7 +19,8 @@ use rayon::prelude::*;
 /// Side in pixels of the squares of the latent grid that are solved at a time unless something else is asked for: large pictures need no more
 /// memory than small ones.
 pub const TILE: usize = 448;
-/// Pixels around such a square that are solved with it.
+/// Pixels around such a square that are solved with it. Of a frame that is turned by more than 4° the corners of squares lie farther off: nothing is taken off
+/// there.
 const MARGIN: usize = 16;
 /// What is found counts as noise up to so many of the frame's standard deviations, in squares of side 2 r + 1 around a pixel for this r.
 const NOISE: f32 = 0.4;
