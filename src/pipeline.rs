@@ -581,8 +581,7 @@ impl Run<'_> {
             ..self.settings.deblur.clone()
         };
         let first = if shaken.is_empty() { alone.clone() } else { for_estimates(&alone) };
-        let limit = (LARGEST_PAD * w.max(h) as f64) as usize;
-        let pad = deblur::pad_for(&start_frames.iter().filter_map(|&i| placed[i].as_ref()).collect::<Vec<_>>(), w, h, limit);
+        let pad = self.pad(start_frames.iter().filter_map(|&i| placed[i].as_ref()));
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
         let (base, mut latent) = match scene {
             Some(scene) => (None, scene),
@@ -628,8 +627,7 @@ impl Run<'_> {
             if round + 1 == rounds {
                 self.find_aliasing(&still, &shaken, &latent, at(0.1), at(0.3))?;
             }
-            let moving: Vec<&Tsf> = all.iter().filter_map(|&i| tsfs[i].as_ref()).collect();
-            let pad = deblur::pad_for(&moving, w, h, limit);
+            let pad = self.pad(all.iter().filter_map(|&i| tsfs[i].as_ref()));
             let from = match solution.as_ref().or(base.as_ref()) {
                 Some(found) => self.surrounded(&found.irradiance, found.pad, pad, &still, &shaken),
                 None => self.surrounded(&latent, 0, pad, &still, &shaken),
@@ -719,6 +717,12 @@ impl Run<'_> {
         Ok(solved)
     }
 
+    /// Pixels by which the latent grid surrounds frames under `tsfs`.
+    fn pad<'t>(&self, tsfs: impl Iterator<Item = &'t Tsf>) -> usize {
+        let (w, h) = self.bracket.size();
+        deblur::pad_for(&tsfs.collect::<Vec<_>>(), w, h, (LARGEST_PAD * w.max(h) as f64) as usize)
+    }
+
     /// The mask by which frame `i` counts in the solver.
     fn counting(&self, i: usize) -> Plane {
         mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], self.settings.alpha as f32, self.shares[i])
@@ -751,13 +755,11 @@ impl Run<'_> {
         if !self.settings.between_pixels || still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some) {
             return Ok(());
         }
-        let (w, h) = self.bracket.size();
         let settings = for_estimates(&self.settings.deblur);
         let bytes = |found: &Vec<Option<Rgb>>| found.iter().flatten().map(|f| 12 * f.width() * f.height()).sum();
         let found = self.remembered("aliasing", &format!("{shaken:?} {settings:?}"), bytes, |run| {
             let observations: Vec<Observation> = still.iter().map(|&i| run.observation(i, Tsf::still(run.motions[i]))).collect();
-            let tsfs: Vec<&Tsf> = observations.iter().map(|o| &o.tsf).collect();
-            let pad = deblur::pad_for(&tsfs, w, h, (LARGEST_PAD * w.max(h) as f64) as usize);
+            let pad = run.pad(observations.iter().map(|o| &o.tsf));
             let start = run.surrounded(latent, 0, pad, still, shaken);
             let mut hear = |f: f32| {
                 (run.events)(Event::Progress {

@@ -179,22 +179,19 @@ impl Fine {
         let (w, h) = out.size();
         let first = DVec2::new(core.0 as f64, core.1 as f64) - 0.5;
         let corner = DVec2::new(self.window.corner.0 as f64, self.window.corner.1 as f64);
-        let place = |k: usize| (k % self.window.size.0, k / self.window.size.0);
         let one = |k: usize| {
-            let (x, y) = place(k);
-            let q = DVec2::new(x as f64, y as f64) - self.window.half();
+            let here = DVec2::new((k % self.window.size.0) as f64, (k / self.window.size.0) as f64);
+            let on_frame = here + corner + shift;
+            let q = here - self.window.half();
             let there = back.of(q) + self.window.half() + corner - first;
+            let seen = on_frame.min_element() >= 0.0 && on_frame.x < w as f64 && on_frame.y < h as f64;
             let inside = there.min_element() >= 0.0 && there.max_element() < tile as f64;
-            inside.then(|| self.difference(&back, q).map(|v| (v * exposure_time) as f32))
+            let at = || on_frame.y as usize * w + on_frame.x as usize;
+            (seen && inside).then(|| (at(), self.difference(&back, q).map(|v| (v * exposure_time) as f32)))
         };
-        let found: Vec<Option<[f32; 3]>> = (0..self.window.size.0 * self.window.size.1).into_par_iter().map(one).collect();
-        for (k, values) in found.into_iter().enumerate() {
-            let (x, y) = place(k);
-            let (x, y) = ((corner.x + shift.x) as isize + x as isize, (corner.y + shift.y) as isize + y as isize);
-            let on_frame = x >= 0 && y >= 0 && x < w as isize && y < h as isize;
-            if let Some(values) = values.filter(|_| on_frame) {
-                out.0.iter_mut().zip(values).for_each(|(p, v)| p.data[y as usize * w + x as usize] = v);
-            }
+        let found: Vec<(usize, [f32; 3])> = (0..self.window.size.0 * self.window.size.1).into_par_iter().filter_map(one).collect();
+        for (at, values) in found {
+            out.0.iter_mut().zip(values).for_each(|(p, v)| p.data[at] = v);
         }
     }
 }

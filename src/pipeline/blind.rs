@@ -2,7 +2,6 @@
 
 use super::{Event, Run};
 use crate::blind::{self, Frame, Lack, Look, PatchSetup, Start};
-use crate::deblur;
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
@@ -166,7 +165,7 @@ impl Run<'_> {
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let (w, h) = self.bracket.size();
         let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().unwrap_or_else(Tsf::identity)).collect();
-        let pad = deblur::pad_for(&known.iter().collect::<Vec<_>>(), w, h, (super::LARGEST_PAD * w.max(h) as f64) as usize);
+        let pad = self.pad(known.iter());
         let luminance = blind::luminance_of(&frames, &known, &merged.mean_of(channels), pad);
         Ok(Self::coloured(&merged, &luminance.crop(pad, pad, w, h), channels))
     }
