@@ -167,6 +167,8 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
+/// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
+const SLIGHT: f64 = 4.0;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
 /// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
@@ -549,7 +551,7 @@ impl Run<'_> {
                 sharp[i] = true;
             }
         }
-        let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
         let reference = self.settings.reference.or(centre).or(found).unwrap_or(0);
@@ -583,7 +585,7 @@ impl Run<'_> {
         let first = if shaken.is_empty() { alone.clone() } else { for_estimates(&alone) };
         let pad = self.pad(start_frames.iter().filter_map(|&i| placed[i].as_ref()));
         let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
-        let (base, mut latent) = match scene {
+        let (mut base, mut latent) = match scene {
             Some(scene) => (None, scene),
             None => {
                 let found =
@@ -592,7 +594,7 @@ impl Run<'_> {
                 (Some(found), latent)
             }
         };
-        let estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
+        let mut estimated: Vec<usize> = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
             let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
@@ -609,6 +611,34 @@ impl Run<'_> {
         }
         self.memo.depends(&(self.settings.model, self.settings.focal_px));
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
+        let mut slight = Vec::new();
+        if doubt.is_some() && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
+            let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
+            let (found, blind) = self.remembered(
+                "slight blur",
+                "",
+                |_| 0,
+                |run| {
+                    let found = run.set_free(&all, &still, &tsfs, &latent, reference)?;
+                    Ok((found, run.blind.clone()))
+                },
+            )?;
+            self.blind = blind;
+            if let Some(found) = found {
+                (latent, reduced, base) = (found.start, found.reduced, None);
+                let (w, h) = self.bracket.size();
+                for (&i, tsf) in all.iter().zip(found.tsfs) {
+                    if tsf::extent(&tsf, w, h) < SLIGHT {
+                        slight.push(i);
+                    }
+                    self.motions[i] = tsf.centre();
+                    sharp[i] = false;
+                    tsfs[i] = Some(tsf);
+                }
+                (shaken, still, estimated) = (all, Vec::new(), Vec::new());
+                self.weigh(&sharp, &shaken);
+            }
+        }
         let mut all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
         let start = latent.clone();
         let mut solution = None;
@@ -647,7 +677,7 @@ impl Run<'_> {
             let judge = |&i: &usize| Some((i, self.unexplained(i, misfit(i)?, &start)?));
             // TSFs of a smaller size err by pixels of the frame's: they are judged once they have been refined.
             let rough = reduced && round + 1 < rounds;
-            let hopeless: Vec<(usize, f64)> = shaken.iter().filter(|_| !rough).filter_map(judge).collect();
+            let hopeless: Vec<(usize, f64)> = shaken.iter().filter(|i| !rough && !slight.contains(i)).filter_map(judge).collect();
             if hopeless.is_empty() {
                 latent = solved.cropped();
                 solution = Some(solved);

@@ -63,6 +63,21 @@ pub struct Way {
     pub held_out: f64,
 }
 
+/// What was found once frames that were taken for sharp might move.
+#[derive(Clone, Debug)]
+pub struct Freed {
+    /// See [`Joint::tsfs`].
+    pub tsfs: Vec<Tsf>,
+    /// See [`Joint::luminance`].
+    pub luminance: Plane,
+    /// See [`Joint::scale`].
+    pub scale: usize,
+    /// Extent of each frame's blur in pixels.
+    pub extents: Vec<f64>,
+    /// Held-out residuals (geometric mean over the frames) over those with the frames held still.
+    pub left: f64,
+}
+
 /// A way to begin.
 pub struct Start {
     /// Frame whose TSF is the identity at the start, and whose mean pose is the identity at the end.
@@ -98,6 +113,9 @@ const DRAWN: (usize, f32) = (15, 1.5);
 /// Iterations by which the TSFs of a round are refined, at the coarsest level and at finer ones. More at the coarsest follow what the luminance of that
 /// round still lacks, and are lost on it: with eight the estimate takes twice as long and ends no better.
 const REFINED: (usize, usize) = (4, 8);
+/// Rounds after which frames that were held still have moved as far as they will, and those after which it is seen whether they move at all:
+/// whether the residuals fall below this part of what they were.
+const FREED: (usize, usize, f64) = (6, 3, 0.93);
 /// Rounds of luminance and TSFs under the assumption that frames did not move.
 const STILLED: usize = 4;
 /// Seed of the draws.
@@ -149,14 +167,19 @@ fn spread(tsf: &Tsf, ratio: f64) -> Tsf {
 /// The poses of at least [`FAINT`] times the largest weight.
 fn without_faint(tsf: &Tsf) -> Option<Tsf> {
     let most = tsf.poses.iter().map(|p| p.weight).fold(0.0, f64::max);
-    Tsf::new(tsf.focal_px, tsf.poses.iter().copied().filter(|p| p.weight >= FAINT * most).collect()).ok()
+    Tsf::new(tsf.focal_px, tsf.poses.iter().copied().filter(|p| p.weight >= FAINT * most).collect()).ok().map(|t| t.about(tsf.base))
 }
 
 /// Γ ∘ M⁻¹ for all poses, M the mean pose of the frame `reference`: the TSFs of the scene warped by M, which is returned. Roll and
-/// translation only.
+/// translation only, for TSFs about the identity; the base of another takes M⁻¹.
 pub fn fix_warp(tsfs: &mut [Tsf], reference: usize) -> Pose {
     let m = tsfs[reference].mean();
-    for p in tsfs.iter_mut().flat_map(|t| &mut t.poses) {
+    let back = m.homography(tsfs[reference].focal_px).inverse();
+    let (displaced, in_place): (Vec<&mut Tsf>, Vec<&mut Tsf>) = tsfs.iter_mut().partition(|t| t.base != DMat3::IDENTITY);
+    for tsf in displaced {
+        tsf.base *= back;
+    }
+    for p in in_place.into_iter().flat_map(|t| &mut t.poses) {
         let theta = p.theta_z_deg - m.theta_z_deg;
         let (s, c) = theta.to_radians().sin_cos();
         // T(t) R(θ) R(-θm) T(-m) = T(t - R(θ-θm) m) R(θ-θm)
@@ -285,8 +308,7 @@ impl Level {
                     return self.fit(frame, &state.latent, Some(tsf), error);
                 }
                 let weight = self.weight(frame, error);
-                let whole =
-                    WholeFrame { latent: &state.latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
+                let whole = WholeFrame { latent: &state.latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: tsf.base };
                 Some(whole.refine(tsf, REFINED.1))
             };
             let fits: Vec<Option<Tsf>> = (0..self.frames.len()).into_par_iter().map(fit).collect();
@@ -308,7 +330,8 @@ impl Level {
 
     fn fit(&self, frame: &Frame, latent: &Plane, start: Option<&Tsf>, model_error: f32) -> Option<Tsf> {
         let weight = self.weight(frame, model_error);
-        let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: DMat3::IDENTITY };
+        let base = start.map_or(DMat3::IDENTITY, |t| t.base);
+        let whole = WholeFrame { latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base };
         // Faint poses are the fit's answer to noise and to what the luminance still lacks; unchecked, they widen the TSF round by round.
         let rough = match start {
             Some(start) if self.near => whole.fit_around(start)?,
@@ -340,6 +363,21 @@ impl Level {
         }
     }
 
+    /// `scene` at this level, its TSFs given.
+    fn placed(&self, scene: &Plane, tsfs: &[Tsf], reference: usize) -> State {
+        State {
+            reference,
+            latent: shrunk(scene, self.scale).padded(self.pad),
+            tsfs: tsfs.iter().map(|t| t.scaled(1.0 / self.scale as f64)).collect(),
+        }
+    }
+
+    /// TSFs and luminance of `state` on frames of `size`, the whole one.
+    fn on_frame(&self, state: &State, size: (usize, usize)) -> (Vec<Tsf>, Plane) {
+        let tsfs = state.tsfs.iter().map(|t| tsf::filled(t, self.scale as f64)).collect();
+        (tsfs, self.enlarged(&state.latent, self.scale, size, 0))
+    }
+
     /// `latent` of this level on a grid of `size` plus `pad` pixels on every side, `ratio` of them to one of its own.
     fn enlarged(&self, latent: &Plane, ratio: usize, size: (usize, usize), pad: usize) -> Plane {
         let at = |v: usize| (v as f64 - pad as f64 + 0.5) / ratio as f64 - 0.5 + self.pad as f64;
@@ -363,6 +401,16 @@ fn coarsest(frames: &[Frame]) -> usize {
     let longer = frames[0].blurred.width.max(frames[0].blurred.height);
     let mut scale = 1;
     while longer / scale > COARSEST {
+        scale *= 2;
+    }
+    scale
+}
+
+/// The finest level that is worked on: pixels of the frame per pixel of it.
+fn finest(frames: &[Frame]) -> usize {
+    let (w, h) = frames[0].blurred.size();
+    let mut scale = 1;
+    while w * h / (scale * scale) > LARGEST && scale < coarsest(frames) {
         scale *= 2;
     }
     scale
@@ -487,12 +535,7 @@ pub fn estimate(
     merged: (&Plane, &[Tsf]),
     progress: &mut dyn FnMut(Stage) -> bool,
 ) -> Option<Joint> {
-    let (w, h) = frames[0].blurred.size();
-    let first = coarsest(frames);
-    let mut last = 1;
-    while w * h / (last * last) > LARGEST && last < first {
-        last *= 2;
-    }
+    let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     let next = (first > last).then_some(first / 2);
     let search = cost(first, ROUNDS.0 * starts.len());
@@ -528,21 +571,51 @@ pub fn estimate(
     let held_out = level.judge(&state);
     let if_still = if doubted.is_empty() { 1.0 } else { level.growth(&state, doubted) };
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
-    let mut still = State {
-        reference: state.reference,
-        latent: shrunk(merged.0, last).padded(level.pad),
-        tsfs: merged.1.iter().map(|t| t.scaled(1.0 / last as f64)).collect(),
-    };
+    let mut still = level.placed(merged.0, merged.1, state.reference);
     level.settle(&mut still);
     let held_out_merge = level.judge(&still);
-    Some(Joint {
-        luminance: level.enlarged(&state.latent, last, (w, h), 0),
-        tsfs: state.tsfs.iter().map(|t| tsf::filled(t, last as f64)).collect(),
-        scale: last,
-        reference: state.reference,
-        held_out,
-        held_out_merge,
-        if_still,
-        ways,
-    })
+    let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
+    Some(Joint { luminance, tsfs, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
+}
+
+/// What the blurs of all `frames` become where those taken for sharp, `still`, may have moved as well: from the scene as these show it, `latent`, and
+/// the TSFs that follow from it, `tsfs`, of which the frame `reference` lies about the identity. TSFs are fitted to drawn scenes: the best one
+/// has the blur that those frames share, and under it they stand still. From nearby that finds a blur of a pixel or two, which the coarse
+/// levels of [`estimate`] cannot tell. Where residuals hardly fall the rounds end early. `None` where `progress` returns `false`.
+pub fn freed(
+    frames: &[Frame],
+    latent: &Plane,
+    tsfs: &[Tsf],
+    still: &[usize],
+    reference: usize,
+    progress: &mut dyn FnMut(Stage) -> bool,
+) -> Option<Freed> {
+    let scale = finest(frames);
+    let level = Level::new(frames, scale, true);
+    let mut state = level.stilled(&level.placed(latent, tsfs, reference), still);
+    let residual = |state: &State| geometric_mean(&level.judge(state));
+    let at_rest = residual(&state);
+    let (rounds, first, hardly) = FREED;
+    let mut random = Random::new(SEED, 2);
+    for k in 0..rounds {
+        if !progress(Stage { scale, fraction: (k + 1) as f32 / (rounds + 1) as f32 }) {
+            return None;
+        }
+        if k == first {
+            let mut settled = state.clone();
+            level.settle(&mut settled);
+            if residual(&settled) > hardly * at_rest {
+                break;
+            }
+        }
+        let t = k as f32 / (rounds - 1) as f32;
+        level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
+    }
+    level.settle(&mut state);
+    let left = residual(&state) / at_rest;
+    let size = frames[0].blurred.size();
+    let (tsfs, luminance) = level.on_frame(&state, size);
+    let (w, h) = level.size;
+    let extents = state.tsfs.iter().map(|t| scale as f64 * tsf::extent(t, w, h)).collect();
+    Some(Freed { tsfs, luminance, scale, extents, left })
 }

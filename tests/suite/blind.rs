@@ -60,6 +60,19 @@ fn fixing_the_warp_moves_every_point_as_before() {
     }
 }
 
+#[test]
+fn fixing_the_warp_moves_displaced_frames_as_before() {
+    let base = glam::DMat3::from_translation(glam::DVec2::new(12.0, -7.0)) * glam::DMat3::from_rotation_z(0.01);
+    let mut tsfs = vec![path(5, [1.0, 2.0, 0.3], [3.0, -1.0, 0.9], 0.5), path(4, [-3.0, 0.0, -0.5], [2.0, 5.0, 0.2], 0.0).about(base)];
+    let before = tsfs.clone();
+    let m = fix_warp(&mut tsfs, 0).homography(150.0);
+    assert_eq!(tsfs[1].poses, before[1].poses, "its poses stay about its base");
+    let x = glam::DVec2::new(70.0, -40.0);
+    let moved = unshaken::pose::project(&tsfs[1].base, unshaken::pose::project(&m, x));
+    let old = unshaken::pose::project(&base, x);
+    assert!((moved - old).length() < 1e-9, "{moved} is not {old}");
+}
+
 /// Tiles of random brightness with a little texture: edges in all places, two decades.
 fn tiles(width: usize, height: usize) -> Plane {
     let levels = uniform(5, 4096, -1.5, 1.5);
@@ -233,6 +246,50 @@ fn frames_that_stood_still_are_told_from_shaken_ones() {
     println!("{growth:.2?} {shaken:.2?}, {:.2?}", displaced.extents());
     assert!(growth.iter().all(|g| *g < 1.5), "frames that stood still: {growth:.2?}");
     assert!(shaken.iter().all(|g| *g > 2.0), "shaken ones among them: {shaken:.2?}");
+}
+
+/// Two frames taken for sharp beside one shaken by some pixels: a slight motion of both is found, and none where there was none.
+#[test]
+fn frames_set_free_move_if_they_did() {
+    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let long = shakes().swap_remove(2);
+    let place = |x, y| Tsf::still(glam::DMat3::from_translation(glam::DVec2::new(x, y)));
+    let freed = |tsfs: &[Tsf], known: &[Tsf]| {
+        let frames = frames(&latent, tsfs);
+        blind::freed(&frames, &frames[0].blurred, known, &[0, 1], 0, &mut |_| true).unwrap()
+    };
+    let slight = [path(7, [-1.1, 0.2, -0.2], [1.1, -0.2, 0.2], 0.3), path(7, [0.2, -1.2, 0.2], [-0.1, 1.1, -0.1], -0.3)];
+    let moved = freed(&[slight[0].clone(), slight[1].clone(), long.clone()], &[Tsf::identity(), Tsf::identity(), long.clone()]);
+    let placed = [Tsf::identity(), place(9.0, -7.0), long.clone()];
+    let stood = freed(&placed, &placed);
+    // About its own place, a displaced frame moves as one in place does.
+    let apart = slight[1].clone().about(place(9.0, -7.0).base);
+    let both = freed(&[slight[0].clone(), apart.clone(), long.clone()], &placed);
+    let error = |found: &blind::Freed| difference(&found.luminance, &latent.crop(PAD, PAD, SIZE.0, SIZE.1));
+    println!(
+        "moved {:.2} {:.2?} {:.3}, stood {:.2} {:.2?} {:.3}, both {:.2} {:.2?} {:.3}",
+        moved.left,
+        moved.extents,
+        error(&moved),
+        stood.left,
+        stood.extents,
+        error(&stood),
+        both.left,
+        both.extents,
+        error(&both)
+    );
+    assert!(stood.extents[..2].iter().all(|e| *e < 1.0), "moved by {:.2?} px where nothing moved", stood.extents);
+    for found in [&moved, &both] {
+        assert!(found.left < 0.6, "{:.2} left", found.left);
+        for (k, tsf) in slight.iter().enumerate() {
+            let (e, truth) = (found.extents[k], tsf::extent(tsf, SIZE.0, SIZE.1));
+            assert!((e - truth).abs() < 1.2, "frame {k} moved by {e:.2} px, in truth {truth:.2}");
+        }
+    }
+    let mean = both.tsfs[0].mean();
+    assert!(mean.t_x.hypot(mean.t_y) < 0.05, "the reference rests: {mean:?}");
+    let lies = tsf::Tsf::centre(&both.tsfs[1]).z_axis;
+    assert!((lies.x - 9.0).hypot(lies.y + 7.0) < 0.5, "the other one stays where it lies: {lies}");
 }
 
 #[test]
