@@ -372,6 +372,12 @@ impl Level {
         }
     }
 
+    /// Extent of each frame's blur in pixels of the frame.
+    fn extents(&self, state: &State) -> Vec<f64> {
+        let (w, h) = self.size;
+        state.tsfs.iter().map(|t| self.scale as f64 * tsf::extent(t, w, h)).collect()
+    }
+
     /// TSFs and luminance of `state` on frames of `size`, the whole one.
     fn on_frame(&self, state: &State, size: (usize, usize)) -> (Vec<Tsf>, Plane) {
         let tsfs = state.tsfs.iter().map(|t| tsf::filled(t, self.scale as f64)).collect();
@@ -493,8 +499,7 @@ impl Look {
 
     /// Extent of each frame's blur in pixels: for frames of a few hundred pixels enough to know which of them stood still.
     pub fn extents(&self) -> Vec<f64> {
-        let (w, h) = self.level.size;
-        self.state.tsfs.iter().map(|t| self.level.scale as f64 * tsf::extent(t, w, h)).collect()
+        self.level.extents(&self.state)
     }
 }
 
@@ -595,27 +600,30 @@ pub fn freed(
     let mut state = level.stilled(&level.placed(latent, tsfs, reference), still);
     let residual = |state: &State| geometric_mean(&level.judge(state));
     let at_rest = residual(&state);
+    let settled = |state: &State| {
+        let mut state = state.clone();
+        level.settle(&mut state);
+        let left = residual(&state) / at_rest;
+        (state, left)
+    };
     let (rounds, first, hardly) = FREED;
     let mut random = Random::new(SEED, 2);
-    for k in 0..rounds {
-        if !progress(Stage { scale, fraction: (k + 1) as f32 / (rounds + 1) as f32 }) {
-            return None;
-        }
-        if k == first {
-            let mut settled = state.clone();
-            level.settle(&mut settled);
-            if residual(&settled) > hardly * at_rest {
-                break;
+    let (state, left) = 'moved: {
+        for k in 0..rounds {
+            if !progress(Stage { scale, fraction: (k + 1) as f32 / (rounds + 1) as f32 }) {
+                return None;
             }
+            if k == first {
+                let found = settled(&state);
+                if found.1 > hardly {
+                    break 'moved found;
+                }
+            }
+            let t = k as f32 / (rounds - 1) as f32;
+            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
         }
-        let t = k as f32 / (rounds - 1) as f32;
-        level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
-    }
-    level.settle(&mut state);
-    let left = residual(&state) / at_rest;
-    let size = frames[0].blurred.size();
-    let (tsfs, luminance) = level.on_frame(&state, size);
-    let (w, h) = level.size;
-    let extents = state.tsfs.iter().map(|t| scale as f64 * tsf::extent(t, w, h)).collect();
-    Some(Freed { tsfs, luminance, scale, extents, left })
+        settled(&state)
+    };
+    let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
+    Some(Freed { tsfs, luminance, scale, extents: level.extents(&state), left })
 }
