@@ -5,6 +5,7 @@ use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::kernels::NOISE_STEPS;
 use crate::response::Response;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Shot and read noise of a camera at one sensitivity, in units of the exposure (1 = white).
@@ -64,6 +65,8 @@ pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
 
 /// Side of the blocks whose variance is measured, pixels.
 const BLOCK: usize = 8;
+/// Blocks of one channel that are enough to tell the noise by, about.
+const ENOUGH: usize = 60_000;
 /// Quantile of the blocks' variances that is taken for noise alone: texture only ever adds.
 const QUANTILE: f64 = 0.05;
 /// That quantile of the mean square of 64 samples of filtered white noise over its expectation (2·10⁴ simulated blocks).
@@ -115,25 +118,22 @@ struct Source<'a> {
 /// Samples of all frames and of all differences.
 fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<Sample> {
     let source = |i: usize, c: usize| Source { intensity: &frames[i].intensity.0[c], exposure: &exposures[i].0[c], less: None };
-    let mut alone: Vec<Sample> = Vec::new();
-    for (i, frame) in frames.iter().enumerate() {
-        for c in 0..3 {
-            collect_blocks(&source(i, c), lag, &quantisation(response, c, frame.levels), &mut alone);
-        }
-    }
-    let mut found = bins(alone);
+    let each = |i: usize| {
+        let blocks = (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
+        blocks.collect::<Vec<Sample>>()
+    };
+    let mut found = bins((0..frames.len()).flat_map(each).collect());
     let mut order: Vec<usize> = (0..frames.len()).collect();
     order.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
     for pair in order.windows(2) {
         let (i, j) = (pair[0], pair[1]);
         let ratio = frames[i].exposure_time / frames[j].exposure_time;
-        let mut differences: Vec<Sample> = Vec::new();
-        for c in 0..3 {
+        let differences = (0..3).into_par_iter().flat_map_iter(|c| {
             let less = Some((&frames[j].intensity.0[c], &exposures[j].0[c], ratio));
             let levels = frames[i].levels.min(frames[j].levels);
-            collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels), &mut differences);
-        }
-        found.extend(bins(differences));
+            collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels))
+        });
+        found.extend(bins(differences.collect()));
     }
     found
 }
@@ -162,12 +162,14 @@ fn bins(mut blocks: Vec<Sample>) -> Vec<Sample> {
     samples
 }
 
-/// Appends the high-pass variance of the blocks that no clipping touches.
-fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64, blocks: &mut Vec<Sample>) {
+/// High-pass variance of the blocks that no clipping touches, of [`ENOUGH`] that are spread over the frame where it has more.
+fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) -> Vec<Sample> {
     let (w, h) = source.exposure.size();
+    let mut blocks = Vec::new();
+    let step = BLOCK * (w * h / (BLOCK * BLOCK)).div_ceil(ENOUGH).isqrt().max(1);
     let unclipped = |z: &Plane, i: usize, j: usize| z.at(i, j) > 0.0 && z.at(i, j) < 0.95;
-    for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
-        for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(BLOCK) {
+    for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(step) {
+        for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(step) {
             let mut around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
             let usable = |(i, j): (usize, usize)| unclipped(source.intensity, i, j) && source.less.is_none_or(|l| unclipped(l.0, i, j));
             if !around.all(usable) {
@@ -201,6 +203,7 @@ fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64, bl
             });
         }
     }
+    blocks
 }
 
 /// Share of the samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.

@@ -664,9 +664,7 @@ impl Run<'_> {
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds {
-                let quick =
-                    deblur::Settings { inner: self.settings.deblur.inner * 3 / 8, outer: FIRST_OUTER, ..self.settings.deblur.clone() };
-                for_estimates(&quick)
+                for_first_round(&self.settings.deblur)
             } else {
                 self.settings.deblur.clone()
             };
@@ -734,6 +732,7 @@ impl Run<'_> {
             ids.iter().map(|&i| self.observation(i, tsfs[i].clone().unwrap_or_else(Tsf::identity))).collect();
         let moving = observations.iter().any(|o| !o.tsf.is_identity());
         let stage = if moving { "deblurring" } else { "merging the sharp frames" };
+        self.progress(stage, from)?;
         let events = std::cell::RefCell::new(&mut self.events);
         let mut watch = |planes: &[wgpu::Buffer; 3]| {
             let estimate = Estimate { planes: planes.clone(), width: w, height: h, pad, scale: self.scale };
@@ -1104,6 +1103,11 @@ fn root_mean_square(image: &Rgb) -> f64 {
 fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
     let standard = deblur::Settings::default();
     deblur::Settings { lambda: standard.lambda, prior: Prior::Tv, robust: standard.robust, ..settings.clone() }
+}
+
+/// [`for_estimates`], quick: enough to refine TSFs against, or to see whether they explain their frames.
+fn for_first_round(settings: &deblur::Settings) -> deblur::Settings {
+    for_estimates(&deblur::Settings { inner: settings.inner * 3 / 8, outer: FIRST_OUTER, ..settings.clone() })
 }
 
 /// Displacement in pixels of a blurred frame that the search for its poses covers by itself.

@@ -8,6 +8,7 @@ use crate::pose::nearest_pixel;
 use glam::DMat3;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::borrow::Cow;
 
 /// What the triage found about one frame.
 #[derive(Clone, Debug, Serialize)]
@@ -63,6 +64,60 @@ const SAME: f32 = 0.1;
 /// Common ratio of two frames' light that an exposure time or response which is not quite true explains.
 const MISTAKEN: f32 = 1.4;
 
+/// Most pixels of a frame that are looked at: of larger ones, squares of [`TILE`] pixels spread over the frame, as many as that.
+const ENOUGH: usize = 6_000_000;
+/// Side in pixels of those squares.
+const TILE: usize = 256;
+
+/// The pixels of a frame that are looked at, as planes of their own.
+struct Looked {
+    /// Of the frame.
+    whole: (usize, usize),
+    /// Upper left corners of squares of [`TILE`] pixels, which lie below each other in the planes; none: the whole frame is looked at.
+    tiles: Vec<(usize, usize)>,
+}
+
+impl Looked {
+    /// At most `enough` pixels, but a square, of frames of `whole` = (width, height) pixels.
+    fn at(whole: (usize, usize), enough: usize) -> Self {
+        let (columns, rows) = (whole.0 / TILE, whole.1 / TILE);
+        let every = (columns * rows).div_ceil((enough / (TILE * TILE)).max(1));
+        let tiles = if whole.0 * whole.1 <= enough || every <= 1 {
+            Vec::new()
+        } else {
+            // Each row of squares begins elsewhere, so that they do not make stripes.
+            let chosen = |&(i, j): &(usize, usize)| (i + j * every.isqrt()).is_multiple_of(every);
+            (0..rows).flat_map(|j| (0..columns).map(move |i| (i, j))).filter(chosen).map(|(i, j)| (TILE * i, TILE * j)).collect()
+        };
+        Self { whole, tiles }
+    }
+
+    fn is_whole(&self) -> bool {
+        self.tiles.is_empty()
+    }
+
+    /// Width and height of the planes.
+    fn size(&self) -> (usize, usize) {
+        if self.is_whole() { self.whole } else { (TILE, TILE * self.tiles.len()) }
+    }
+
+    /// The frame's pixel at (x, y) of the planes.
+    fn pixel(&self, x: usize, y: usize) -> (usize, usize) {
+        if self.is_whole() {
+            (x, y)
+        } else {
+            let (left, top) = self.tiles[y / TILE];
+            (left + x, top + y % TILE)
+        }
+    }
+
+    /// Whether a pixel of row `y` of the planes counts: at the end of each square some rows do not, so that no difference reaches into the next.
+    fn counts(&self, y: usize) -> bool {
+        self.is_whole() || y % TILE < TILE - COARSE
+    }
+}
+
+#[derive(Clone)]
 struct Luminance {
     value: Plane,    // irradiance
     variance: Plane, // of it
@@ -104,25 +159,36 @@ impl Luminance {
     }
 
     /// Variance as the frame itself shows it, where that is more than what the noise model says.
-    fn correct(&mut self) {
-        let excess = self.excess();
+    fn correct(&mut self, looked: &Looked) {
+        let excess = self.part(looked).excess();
         self.variance = self.variance.map(|v| v * excess as f32);
         self.noise_error += 1.0 - 1.0 / excess;
     }
 
-    /// As pixels of another frame see it, `motion` being the way from there to here: the nearest pixel, since interpolation would take
-    /// fine structure away.
-    fn seen(&self, motion: &DMat3) -> Self {
+    /// As the pixels of another frame that are `looked` at see it, `motion` being the way from there to here: the nearest pixel, since
+    /// interpolation would take fine structure away.
+    fn seen(&self, motion: &DMat3, looked: &Looked) -> Self {
         let (w, h) = self.value.size();
-        let mut out = Self { value: self.value.clone(), variance: self.variance.clone(), valid: vec![false; w * h], ..*self };
-        for p in 0..w * h {
-            if let Some(q) = nearest_pixel(motion, w, h, p % w, p / w) {
-                out.value.data[p] = self.value.data[q];
-                out.variance.data[p] = self.variance.data[q];
-                out.valid[p] = self.valid[q];
-            }
-        }
-        out
+        let (width, height) = looked.size();
+        let still = *motion == DMat3::IDENTITY;
+        let sources: Vec<Option<usize>> = (0..width * height)
+            .into_par_iter()
+            .map(|p| {
+                let (x, y) = looked.pixel(p % width, p / width);
+                if !looked.counts(p / width) { None } else if still { Some(y * w + x) } else { nearest_pixel(motion, w, h, x, y) }
+            })
+            .collect();
+        let plane = |from: &Plane| {
+            let data = sources.iter().map(|q| q.map_or(0.0, |q| from.data[q])).collect();
+            Plane { width, height, data }
+        };
+        let valid = sources.iter().map(|q| q.is_some_and(|q| self.valid[q])).collect();
+        Self { value: plane(&self.value), variance: plane(&self.variance), valid, ..*self }
+    }
+
+    /// The pixels that are `looked` at, nothing being copied where these are all.
+    fn part(&self, looked: &Looked) -> Cow<'_, Self> {
+        if looked.is_whole() { Cow::Borrowed(self) } else { Cow::Owned(self.seen(&DMat3::IDENTITY, looked)) }
     }
 
     /// The pixels at which this frame and `other` see the same light around: structure that a lamp's trail draws over the dark beside it is
@@ -206,10 +272,11 @@ fn share(own: &Energy, other: &Energy) -> Option<f64> {
 
 /// [`Verdict::detail`] of two frames against each other, `motion` being the way from the first's pixels to the second's; `None` where nothing
 /// tells.
-fn details(a: &Luminance, b: &Luminance, motion: &DMat3) -> [Option<f64>; 2] {
+fn details(a: &Luminance, b: &Luminance, motion: &DMat3, looked: &Looked) -> [Option<f64>; 2] {
     // Each of the two on its own pixels, of which those count that the other sees as well.
     let apart = *motion != DMat3::IDENTITY;
-    let (b_seen, a_seen) = (apart.then(|| b.seen(motion)), apart.then(|| a.seen(&motion.inverse())));
+    let (b_seen, a_seen) = (apart.then(|| b.seen(motion, looked)), apart.then(|| a.seen(&motion.inverse(), looked)));
+    let (a, b) = (&*a.part(looked), &*b.part(looked));
     let (b_seen, a_seen) = (b_seen.as_ref().unwrap_or(b), a_seen.as_ref().unwrap_or(a));
     let on_a = a.shared(b_seen);
     let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
@@ -245,16 +312,23 @@ pub fn triage(
     given: Option<&[usize]>,
     motions: &[DMat3],
 ) -> Vec<Verdict> {
-    let mut all: Vec<Luminance> = frames.iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
-    let verdict = |a| Verdict { sharp: false, detail: 1.0, compared: false, steepness: steepness(a), reason: String::new() };
+    let looked = Looked::at(frames[0].intensity.size(), ENOUGH);
+    let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
+    let verdict = |a: &Luminance| Verdict {
+        sharp: false,
+        detail: 1.0,
+        compared: false,
+        steepness: steepness(&a.part(&looked)),
+        reason: String::new(),
+    };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
-    all.iter_mut().for_each(Luminance::correct);
+    all.par_iter_mut().for_each(|a| a.correct(&looked));
     // A frame that is left out is measured against the others, not they against it. One pair after the other: each takes several planes.
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
     let found: Vec<[Option<f64>; 2]> =
-        pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()))).collect();
+        pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()), &looked)).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
         for (k, own, other) in [(0, i, j), (1, j, i)] {
             if !excluded[other]

@@ -197,7 +197,7 @@ impl Run<'_> {
             // One alone stands still beside another's motion, whatever it did itself.
             let tells = still.len() > 1 || (still.len() == 1 && frames.len() == used.len());
             if !shaken.is_empty() && tells && stands(self.if_still(seen, &still), still.len()) {
-                return Ok(self.settled(alike, shaken));
+                return self.settled(alike, shaken);
             }
         }
         let doubtful = !passing.is_empty();
@@ -214,7 +214,7 @@ impl Run<'_> {
                 };
             }
             if !none_still && (!still.is_empty() || passing.len() == 1) {
-                return Ok(self.settled(passing, shaken));
+                return self.settled(passing, shaken);
             }
         }
         let look = seen.filter(|seen| seen.frames == used && seen.whole).map(|seen| seen.look);
@@ -225,7 +225,7 @@ impl Run<'_> {
         }
         let moved = without(passing, &still);
         if moved.len() < passing.len() || passing.len() == 1 {
-            return Ok(self.settled(passing, moved));
+            return self.settled(passing, moved);
         }
         self.degrade(
             "every frame that could be sharp seems to have moved, and camera shake does not explain the frames: they are merged without \
@@ -245,22 +245,48 @@ impl Run<'_> {
 
     /// The frames that stay sharp of those that pass for it (`passing`), of which `moved` seem to have. One alone stays: that it moved is not
     /// believed either.
-    fn settled(&mut self, passing: &[usize], moved: Vec<usize>) -> AllBlurs {
+    fn settled(&mut self, passing: &[usize], moved: Vec<usize>) -> Result<AllBlurs> {
         let still = without(passing, &moved);
-        AllBlurs::Sharp(if still.is_empty() { passing.to_vec() } else { without(passing, &self.confirmed(moved, &still)) })
+        Ok(AllBlurs::Sharp(if still.is_empty() { passing.to_vec() } else { without(passing, &self.confirmed(moved, &still)?) }))
     }
 
-    /// Those of the frames `moved` that are blurred beside the frames `still`, too: a coarse look at frames that all are noisy errs by some pixels
-    /// now and then, and a sharp frame that counts as shaken is missed where the blurs of the others are estimated.
-    fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Vec<usize> {
+    /// Those of the frames `moved` that are blurred beside the frames `still`, too, and explained by that: a coarse look at frames that all are noisy
+    /// errs by some pixels now and then, what JPEG files make of lamps passes for blur, and a sharp frame that counts as shaken is missed where the
+    /// blurs of the others are estimated.
+    fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Result<Vec<usize>> {
         if moved.is_empty() {
-            return moved;
+            return Ok(moved);
         }
         let sharp: Vec<bool> = (0..self.exposures.len()).map(|i| still.contains(&i)).collect();
         self.weigh(&sharp, &[still, &moved].concat());
         let (scene, _) = self.start(still, 0);
         let (w, h) = self.bracket.size();
-        moved.into_iter().filter(|&i| self.estimate(i, &scene).0.is_none_or(|t| tsf::extent(&t, w, h) > CONFIRMED)).collect()
+        let mut tsfs: Vec<Option<Tsf>> = vec![None; self.exposures.len()];
+        for &i in &moved {
+            tsfs[i] = self.estimate(i, &scene).0;
+        }
+        let blurred = |i: &usize| tsfs[*i].as_ref().is_none_or(|t| tsf::extent(t, w, h) > CONFIRMED);
+        let blurred: Vec<usize> = moved.into_iter().filter(blurred).collect();
+        self.explained(blurred, still, tsfs, &scene)
+    }
+
+    /// Those of the frames `blurred` that their blurs explain beside the frames `still`, which show `scene`, and those without a TSF.
+    fn explained(&mut self, blurred: Vec<usize>, still: &[usize], mut tsfs: Vec<Option<Tsf>>, scene: &Rgb) -> Result<Vec<usize>> {
+        let judged: Vec<usize> = blurred.iter().copied().filter(|&i| tsfs[i].is_some()).collect();
+        if judged.is_empty() {
+            return Ok(blurred);
+        }
+        for &i in still {
+            tsfs[i] = Some(Tsf::still(self.motions[i]));
+        }
+        let all = [still, &judged].concat();
+        let settings = super::for_first_round(&self.settings.deblur);
+        let pad = self.pad(all.iter().filter_map(|&i| tsfs[i].as_ref()));
+        let from = self.surrounded(scene, 0, pad, still, &judged);
+        let solved = self.solve(&all, &tsfs, &from, pad, &settings, 0.02, 0.02)?;
+        let misfits = all.iter().zip(&solved.misfit).skip(still.len());
+        let failing: Vec<usize> = misfits.filter(|(i, misfit)| self.unexplained(**i, misfit, scene).is_some()).map(|(i, _)| *i).collect();
+        Ok(without(&blurred, &failing))
     }
 
     /// Frame of `used` to start from, its luminance the mean of `channels`, and the next best: the shortest are nearly always the least blurred.
