@@ -85,8 +85,7 @@ fn iterates(gpu: &Gpu, kernels: &Kernels, made: &SyntheticBracket, settings: &Se
     let (frames, (w, h)) = (bracket.frames(), bracket.size());
     let level = NoiseModel::from_electrons(camera.full_well, camera.read_noise);
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &camera.response)).collect();
-    let curves: Vec<[Vec<f32>; 3]> =
-        frames.iter().map(|f| std::array::from_fn(|c| level.curve(&camera.response, c, f.levels))).collect();
+    let curves: Vec<[Vec<f32>; 3]> = frames.iter().map(|f| std::array::from_fn(|c| level.curve(&camera.response, c, f.levels))).collect();
     let places: Vec<_> = made.tsfs.iter().map(Tsf::centre).collect();
     let masks = mask::counting(frames, &made.sharp, 0.3, &places);
     let observations: Vec<Observation> = (0..frames.len())
@@ -113,7 +112,8 @@ fn iterates(gpu: &Gpu, kernels: &Kernels, made: &SyntheticBracket, settings: &Se
         seen.start = Instant::now();
     };
     let mut progress = |_| seen.borrow_mut().look(gpu, latent).is_ok();
-    let solution = deblur::solve_watched(gpu, kernels, &observations, &merged.map_planes(around), pad, settings, &mut watch, &mut progress)?;
+    let solution =
+        deblur::solve_watched(gpu, kernels, &observations, &merged.map_planes(around), pad, settings, &mut watch, &mut progress)?;
     let mut seen = seen.into_inner();
     seen.look(gpu, solution.irradiance.size())?;
     let judge = Judge::default();

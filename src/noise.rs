@@ -119,7 +119,8 @@ struct Source<'a> {
 fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<Sample> {
     let source = |i: usize, c: usize| Source { intensity: &frames[i].intensity.0[c], exposure: &exposures[i].0[c], less: None };
     let each = |i: usize| {
-        let blocks = (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
+        let blocks =
+            (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
         blocks.collect::<Vec<Sample>>()
     };
     let mut found = bins((0..frames.len()).flat_map(each).collect());

@@ -663,11 +663,7 @@ impl Run<'_> {
                 None => self.surrounded(&latent, 0, pad, &still, &shaken),
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
-            let settings = if round + 1 < rounds {
-                for_first_round(&self.settings.deblur)
-            } else {
-                self.settings.deblur.clone()
-            };
+            let settings = if round + 1 < rounds { for_first_round(&self.settings.deblur) } else { self.settings.deblur.clone() };
             let now = format!("{round} {shaken:?}");
             let solved =
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;

@@ -175,7 +175,13 @@ impl Luminance {
             .into_par_iter()
             .map(|p| {
                 let (x, y) = looked.pixel(p % width, p / width);
-                if !looked.counts(p / width) { None } else if still { Some(y * w + x) } else { nearest_pixel(motion, w, h, x, y) }
+                if !looked.counts(p / width) {
+                    None
+                } else if still {
+                    Some(y * w + x)
+                } else {
+                    nearest_pixel(motion, w, h, x, y)
+                }
             })
             .collect();
         let plane = |from: &Plane| {
