@@ -17,7 +17,7 @@ use unshaken::{mask, merge};
 
 /// Outer iterations after which nothing changes any more.
 const LONG: usize = 24;
-/// How near to the converged result, dB.
+/// How far below the converged result, dB, an iterate has reached it.
 const NEAR: f64 = 0.1;
 /// Size of the frames, content beyond them, pixels, median luminance (part of white after 1 s) and seed.
 const SIZE: (usize, usize) = (384, 288);
@@ -45,10 +45,10 @@ fn main() -> Result<(), Failure> {
         println!("{name}: converged {converged:.2} dB");
         for (scheme, settings) in [("plain", &plain), ("default", &defaults), ("plain", &plain), ("default", &defaults)] {
             let found = iterates(&gpu, &kernels, &made, settings)?;
-            let near = found.iter().find(|(_, db)| (db - converged).abs() < NEAR);
-            let when = near.map_or("not within".into(), |(s, _)| format!("{s:.1} s to within"));
+            let near = found.iter().find(|(_, db)| *db > converged - NEAR);
+            let when = near.map_or("never at".into(), |(s, _)| format!("{s:.1} s to"));
             let course = found.iter().map(|(s, db)| format!("{s:.1} s {db:.2}")).collect::<Vec<_>>().join(", ");
-            println!("  {scheme}: {when} {NEAR} dB; {course}");
+            println!("  {scheme}: {when} {NEAR} dB below it; {course}");
         }
     }
     Ok(())
