@@ -276,13 +276,12 @@ fn share(own: &Energy, other: &Energy) -> Option<f64> {
     Some(share + 2.0 * scatter.sqrt() / other.sum)
 }
 
-/// [`Verdict::detail`] of two frames against each other, `motion` being the way from the first's pixels to the second's; `None` where nothing
-/// tells.
-fn details(a: &Luminance, b: &Luminance, motion: &DMat3, looked: &Looked) -> [Option<f64>; 2] {
+/// [`Verdict::detail`] of two frames against each other, as a whole and the pixels of each that are `looked` at, `motion` being the way from the
+/// first's pixels to the second's; `None` where nothing tells.
+fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, looked: &Looked) -> [Option<f64>; 2] {
     // Each of the two on its own pixels, of which those count that the other sees as well.
     let apart = *motion != DMat3::IDENTITY;
-    let (b_seen, a_seen) = (apart.then(|| b.seen(motion, looked)), apart.then(|| a.seen(&motion.inverse(), looked)));
-    let (a, b) = (&*a.part(looked), &*b.part(looked));
+    let (b_seen, a_seen) = (apart.then(|| whole[1].seen(motion, looked)), apart.then(|| whole[0].seen(&motion.inverse(), looked)));
     let (b_seen, a_seen) = (b_seen.as_ref().unwrap_or(b), a_seen.as_ref().unwrap_or(a));
     let on_a = a.shared(b_seen);
     let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
@@ -330,11 +329,12 @@ pub fn triage(
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
     all.par_iter_mut().for_each(|a| a.correct(&looked));
+    let parts: Vec<Cow<Luminance>> = all.par_iter().map(|a| a.part(&looked)).collect();
     // A frame that is left out is measured against the others, not they against it. One pair after the other: each takes several planes.
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
-    let found: Vec<[Option<f64>; 2]> =
-        pairs.iter().map(|&(i, j)| details(&all[i], &all[j], &(motions[j] * motions[i].inverse()), &looked)).collect();
+    let of = |&(i, j): &(usize, usize)| details([&all[i], &all[j]], [&parts[i], &parts[j]], &(motions[j] * motions[i].inverse()), &looked);
+    let found: Vec<[Option<f64>; 2]> = pairs.iter().map(of).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
         for (k, own, other) in [(0, i, j), (1, j, i)] {
             if !excluded[other]
