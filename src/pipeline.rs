@@ -515,6 +515,15 @@ impl Run<'_> {
         let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
         let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
         let doubt = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
+        if may_doubt {
+            let (unsure, sure) = blind::unsure_beside(&verdicts, &sharp, &used);
+            if !unsure.is_empty() {
+                self.progress("looking whether frames that seem sharp moved", 0.03)?;
+                for i in self.remembered("frames that seem sharp", "", |_| 0, |run| run.confirmed(unsure, &sure))? {
+                    sharp[i] = false;
+                }
+            }
+        }
         let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
         let mut unexplained = merged_only;
         if merged_only {

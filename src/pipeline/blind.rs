@@ -85,6 +85,9 @@ const LEAST_DETAIL: f64 = 0.1;
 /// Steepness of the sharpest edges up to which a frame that passes for sharp may be blurred by some pixels: frames blurred by 4 px and more
 /// measure up to 0.55, sharp ones of scenes with hard edges 0.58 and more, of soft scenes from 0.39 on.
 const SURELY_STEEP: f64 = 0.57;
+/// Detail up to which a frame that has no steep edge may be blurred, though another frame is surely sharp: frames blurred by 4 px measure up to
+/// 0.71, sharp ones from 0.74 on, most of them above 0.84.
+const SURELY_DETAILED: f64 = 0.85;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
 /// Growth of the residuals, if a frame alone or several did not move, up to which they did not: sharp frames in place and displaced measure up to 1.3
@@ -117,6 +120,16 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
         return None;
     }
     Some(Doubt { passing: frames.iter().copied().filter(|&i| sharp[i]).collect(), frames })
+}
+
+/// Frames that pass for sharp with little to spare, and the others that do, where one of those surely is: a steep edge of one frame says nothing
+/// of the next.
+pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> (Vec<usize>, Vec<usize>) {
+    let passing = used.iter().copied().filter(|&i| sharp[i]);
+    let surely_steep = |i: usize| verdicts[i].steepness >= SURELY_STEEP;
+    let (unsure, sure): (Vec<usize>, Vec<usize>) =
+        passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED && !surely_steep(i));
+    if sure.iter().any(|&i| surely_steep(i)) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
 }
 
 /// Whether `count` frames stood still, if residuals grow so much when they are held.
@@ -253,7 +266,7 @@ impl Run<'_> {
     /// Those of the frames `moved` that are blurred beside the frames `still`, too, and explained by that: a coarse look at frames that all are noisy
     /// errs by some pixels now and then, what JPEG files make of lamps passes for blur, and a sharp frame that counts as shaken is missed where the
     /// blurs of the others are estimated.
-    fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Result<Vec<usize>> {
+    pub(super) fn confirmed(&mut self, moved: Vec<usize>, still: &[usize]) -> Result<Vec<usize>> {
         if moved.is_empty() {
             return Ok(moved);
         }
@@ -533,9 +546,24 @@ impl Run<'_> {
 mod tests {
     use super::*;
 
+    fn verdict(detail: f64, steepness: f64, sharp: bool) -> Verdict {
+        Verdict { sharp, detail, compared: true, steepness, reason: String::new() }
+    }
+
+    #[test]
+    fn frames_without_steep_edges_are_asked_beside_one_that_has_them() {
+        let of = |all: &[Verdict], used: &[usize]| unsure_beside(all, &all.iter().map(|v| v.sharp).collect::<Vec<_>>(), used);
+        let mut all = [verdict(1.0, 0.7, true), verdict(0.71, 0.5, true), verdict(0.95, 0.5, true), verdict(0.2, 0.5, false)];
+        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]));
+        assert_eq!(of(&all, &[1, 2, 3]), (vec![], vec![]), "none of those in use is surely sharp: that is a doubt about all");
+        all[1] = verdict(0.71, 0.6, true);
+        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "it has a steep edge of its own");
+        all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
+        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
+    }
+
     #[test]
     fn doubt_is_about_frames_without_steep_edges() {
-        let verdict = |detail, steepness, sharp| Verdict { sharp, detail, compared: true, steepness, reason: String::new() };
         let of = |all: &[Verdict], used: &[usize]| {
             let sharp: Vec<bool> = all.iter().map(|v| v.sharp).collect();
             doubted(all, &sharp, used).map(|d| (d.frames, d.passing))
