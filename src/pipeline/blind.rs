@@ -85,8 +85,8 @@ const LEAST_DETAIL: f64 = 0.1;
 /// Steepness of the sharpest edges up to which a frame that passes for sharp may be blurred by some pixels: frames blurred by 4 px and more
 /// measure up to 0.55, sharp ones of scenes with hard edges 0.58 and more, of soft scenes from 0.39 on.
 const SURELY_STEEP: f64 = 0.57;
-/// Detail up to which a frame that has no steep edge may be blurred, though another frame is surely sharp: frames blurred by 4 px measure up to
-/// 0.71, sharp ones from 0.74 on, most of them above 0.84.
+/// Detail up to which a frame that passes for sharp may be blurred, though another frame is surely sharp: most sharp ones measure more. At night, where
+/// little but lamps can be seen, blurred ones may do so too.
 const SURELY_DETAILED: f64 = 0.85;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
@@ -123,13 +123,11 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
 }
 
 /// Frames that pass for sharp with little to spare, and the others that do, where one of those surely is: a steep edge of one frame says nothing
-/// of the next.
+/// of the next, and the trail of a lamp has steep edges of its own.
 pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> (Vec<usize>, Vec<usize>) {
     let passing = used.iter().copied().filter(|&i| sharp[i]);
-    let surely_steep = |i: usize| verdicts[i].steepness >= SURELY_STEEP;
-    let (unsure, sure): (Vec<usize>, Vec<usize>) =
-        passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED && !surely_steep(i));
-    if sure.iter().any(|&i| surely_steep(i)) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
+    let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED);
+    if sure.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
 }
 
 /// Whether `count` frames stood still, if residuals grow so much when they are held.
@@ -551,13 +549,13 @@ mod tests {
     }
 
     #[test]
-    fn frames_without_steep_edges_are_asked_beside_one_that_has_them() {
+    fn frames_with_little_to_spare_are_asked_beside_one_that_is_surely_sharp() {
         let of = |all: &[Verdict], used: &[usize]| unsure_beside(all, &all.iter().map(|v| v.sharp).collect::<Vec<_>>(), used);
         let mut all = [verdict(1.0, 0.7, true), verdict(0.71, 0.5, true), verdict(0.95, 0.5, true), verdict(0.2, 0.5, false)];
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]));
         assert_eq!(of(&all, &[1, 2, 3]), (vec![], vec![]), "none of those in use is surely sharp: that is a doubt about all");
         all[1] = verdict(0.71, 0.6, true);
-        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "it has a steep edge of its own");
+        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "trails of lamps have steep edges, too");
         all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
     }
