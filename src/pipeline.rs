@@ -518,7 +518,9 @@ impl Run<'_> {
         if may_doubt {
             let (unsure, sure) = blind::unsure_beside(&verdicts, &sharp, &used);
             if !unsure.is_empty() {
-                self.progress("looking whether frames that seem sharp moved", 0.03)?;
+                self.progress("looking whether frames that seem sharp moved", 0.02)?;
+                // Which frames count as sharp, and all that follows, now depends on the blurs found.
+                self.memo.depends(&(self.settings.model, self.settings.focal_px));
                 for i in self.remembered("frames that seem sharp", "", |_| 0, |run| run.confirmed(unsure, &sure))? {
                     sharp[i] = false;
                 }
