@@ -28,6 +28,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let i = at(p - vec2i(0, params.first), params.size.x);
     let e = irradiance[i];
     right_side[i] = e * back[i] - smoothness(p, i, params.size);
-    // The interpolation has negative lobes: beside masked pixels the approximate diagonal can fall below zero.
-    diagonal[i] = e * e * max(data_diagonal[i], 0.0) + smoothness_diagonal(p, i, params.size) + 1e-20;
+    // The interpolation has negative lobes: beside masked pixels the approximate diagonal K^T W can fall below zero. The true one cannot, and a lamp
+    // there that the frame sees by its lobes alone has much of it, its irradiance squared: its size is nearer the truth than none.
+    diagonal[i] = e * e * abs(data_diagonal[i]) + smoothness_diagonal(p, i, params.size) + 1e-20;
 }

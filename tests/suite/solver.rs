@@ -373,6 +373,33 @@ fn numbers_that_are_none_are_refused() {
 }
 
 #[test]
+fn a_lamp_that_a_shaken_frame_sees_by_the_lobes_of_its_interpolation_alone_does_not_hold_the_gradients_up() {
+    // Far above white in the long frame, which is dark and tells much around it.
+    let (dark, lamp, pad) = (0.02, 400.0, 3);
+    let scene = Rgb::filled(SIZE.0 + 2 * pad, SIZE.1 + 2 * pad, dark);
+    let scene = scene
+        .map_planes(|p| Plane::from_fn(p.width, p.height, |x, y| if (7..10).contains(&x) && (6..9).contains(&y) { lamp } else { dark }));
+    let observed = |tsf: Tsf, exposure_time: f64| {
+        let matrix = matrix(&tsf, pad);
+        let seen = |v: f64| if v * exposure_time < 0.95 { (v * exposure_time) as f32 } else { UNSEEN };
+        let exposure = scene.map_planes(|p| {
+            let values = matrix.apply(&f64s(&p.data)).into_iter().map(seen).collect();
+            Plane::from_vec(SIZE.0, SIZE.1, values).expect("the frame's size")
+        });
+        let mask = exposure.0[0].map(|v| if v == UNSEEN { 0.0 } else { 1.0 });
+        Observation { exposure, mask, exposure_time, noise: curves(), black_clipped: true, tsf }
+    };
+    let bracket = [observed(Tsf::identity(), 0.002), observed(shaken(), 5.0)];
+    assert!(bracket[0].mask.data.iter().all(|m| *m == 1.0) && bracket[1].mask.data.contains(&0.0));
+    let mut initial = scene.clone();
+    for (p, n) in initial.0.iter_mut().zip([31, 32, 33]) {
+        p.data.iter_mut().zip(noise(n, SIZE.0 * SIZE.1 * 4)).for_each(|(v, n)| *v *= 1.0 + 0.3 * n);
+    }
+    let history = run(&bracket, &initial, pad, &Settings { outer: 3, ..settings() }).report.history;
+    assert!(history.len() == 3 && history.iter().all(|i| i.step == 1.0 && i.reduction < 0.02), "{history:?}");
+}
+
+#[test]
 fn a_step_that_would_raise_the_objective_is_halved() {
     // A shaken frame that averages neighbours and counts much, a frame in place that counts little, a start whose columns
     // alternate between twice the truth and almost nothing: its average is right. The step lowers the bright columns at
