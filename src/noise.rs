@@ -8,6 +8,10 @@ use crate::response::Response;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+mod squares;
+
+pub use squares::of_squares;
+
 /// Shot and read noise of a camera at one sensitivity, in units of the exposure (1 = white).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NoiseModel {
@@ -67,10 +71,15 @@ pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
 const BLOCK: usize = 8;
 /// Blocks of one channel that are enough to tell the noise by, about.
 const ENOUGH: usize = 60_000;
-/// Quantile of the blocks' variances that is taken for noise alone: texture only ever adds.
-const QUANTILE: f64 = 0.05;
-/// That quantile of the mean square of 64 samples of filtered white noise over its expectation (2·10⁴ simulated blocks).
-const QUANTILE_OF_NOISE: f64 = 0.554;
+/// Quantile of variances that is taken for noise alone.
+struct Quantile {
+    at: f64,
+    /// That quantile of noise over its expectation.
+    of_noise: f64,
+}
+
+/// That of the variances of blocks, as texture only ever adds; for the mean square of 64 samples of filtered white noise (2·10⁴ simulated blocks).
+const FLATTEST: Quantile = Quantile { at: 0.05, of_noise: 0.554 };
 
 /// Noise level of a bracket's frames, from the high-pass variance of their flattest blocks at each exposure and of the flattest blocks of
 /// the differences between each frame and the next longer one.
@@ -81,7 +90,7 @@ const QUANTILE_OF_NOISE: f64 = 0.554;
 /// do not, it has more, and texture never lowers a variance. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is
 /// usable.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
-    let at_lag = |lag| fit(&samples(frames, exposures, response, lag));
+    let at_lag = |lag| fit(&samples(frames, exposures, response, lag), BELOW);
     match (at_lag(1), at_lag(COARSE_LAG)) {
         // White noise reads the same at both lags, texture only lifts the coarse one a little.
         (Some(fine), Some(coarse)) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
@@ -108,6 +117,13 @@ struct Sample {
     blocks: f64,
 }
 
+impl Sample {
+    /// What `model` says of the variance.
+    fn of(&self, model: &NoiseModel) -> f64 {
+        model.shot * self.shots + model.read * self.reads
+    }
+}
+
 /// One channel of a frame, or of a frame less `ratio` times the next longer one.
 struct Source<'a> {
     intensity: &'a Plane,
@@ -123,7 +139,7 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
             (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
         blocks.collect::<Vec<Sample>>()
     };
-    let mut found = bins((0..frames.len()).flat_map(each).collect());
+    let mut found = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST);
     let mut order: Vec<usize> = (0..frames.len()).collect();
     order.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
     for pair in order.windows(2) {
@@ -134,13 +150,13 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
             let levels = frames[i].levels.min(frames[j].levels);
             collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels))
         });
-        found.extend(bins(differences.collect()));
+        found.extend(bins(differences.collect(), &FLATTEST));
     }
     found
 }
 
-/// Low quantiles of bins of equal population along the exposure, none wider than a factor of 1.5.
-fn bins(mut blocks: Vec<Sample>) -> Vec<Sample> {
+/// Quantiles of bins of equal population along the exposure, none wider than a factor of 1.5.
+fn bins(mut blocks: Vec<Sample>, quantile: &Quantile) -> Vec<Sample> {
     blocks.sort_by(|a, b| a.exposure.total_cmp(&b.exposure));
     let mut samples = Vec::new();
     let mut i = 0;
@@ -152,7 +168,7 @@ fn bins(mut blocks: Vec<Sample>) -> Vec<Sample> {
             let mut v: Vec<f64> = part.iter().map(|b| b.variance).collect();
             v.sort_by(f64::total_cmp);
             let mean = |f: fn(&Sample) -> f64| part.iter().map(f).sum::<f64>() / part.len() as f64;
-            let variance = v[(QUANTILE * v.len() as f64) as usize] / QUANTILE_OF_NOISE;
+            let variance = v[(quantile.at * v.len() as f64) as usize] / quantile.of_noise;
             if variance > 0.0 {
                 let (exposure, shots, reads) = (mean(|b| b.exposure), mean(|b| b.shots), mean(|b| b.reads));
                 samples.push(Sample { exposure, shots, reads, variance, blocks: part.len() as f64 });
@@ -163,16 +179,20 @@ fn bins(mut blocks: Vec<Sample>) -> Vec<Sample> {
     samples
 }
 
+/// Whether a pixel is clipped neither in black nor, for certain, in white.
+fn clear(intensity: &Plane, i: usize, j: usize) -> bool {
+    intensity.at(i, j) > 0.0 && intensity.at(i, j) < 0.95
+}
+
 /// High-pass variance of the blocks that no clipping touches, of [`ENOUGH`] that are spread over the frame where it has more.
 fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) -> Vec<Sample> {
     let (w, h) = source.exposure.size();
     let mut blocks = Vec::new();
     let step = BLOCK * (w * h / (BLOCK * BLOCK)).div_ceil(ENOUGH).isqrt().max(1);
-    let unclipped = |z: &Plane, i: usize, j: usize| z.at(i, j) > 0.0 && z.at(i, j) < 0.95;
     for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(step) {
         for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(step) {
             let mut around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
-            let usable = |(i, j): (usize, usize)| unclipped(source.intensity, i, j) && source.less.is_none_or(|l| unclipped(l.0, i, j));
+            let usable = |(i, j): (usize, usize)| clear(source.intensity, i, j) && source.less.is_none_or(|l| clear(l.0, i, j));
             if !around.all(usable) {
                 continue;
             }
@@ -207,11 +227,13 @@ fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) ->
     blocks
 }
 
-/// Share of the samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.
+/// That part where texture lifts samples: texture lifts samples, and only samples of few blocks fall below.
 const BELOW: f64 = 0.15;
 
 /// Quantile regression of variance = shot · x + read in logarithms, by search over both parameters, each step finer.
-fn fit(samples: &[Sample]) -> Option<NoiseModel> {
+///
+/// `below`: part of the samples that the line passes above.
+fn fit(samples: &[Sample], below: f64) -> Option<NoiseModel> {
     if samples.is_empty() {
         return None;
     }
@@ -219,8 +241,8 @@ fn fit(samples: &[Sample]) -> Option<NoiseModel> {
         samples
             .iter()
             .map(|s| {
-                let r = (s.variance / (shot * s.shots + read * s.reads)).ln();
-                s.blocks * if r > 0.0 { BELOW * r } else { (BELOW - 1.0) * r }
+                let r = (s.variance / s.of(&NoiseModel { shot, read })).ln();
+                s.blocks * if r > 0.0 { below * r } else { (below - 1.0) * r }
             })
             .sum()
     };

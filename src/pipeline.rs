@@ -3,7 +3,7 @@
 use crate::channels;
 use crate::deblur::{self, Observation, Prior, Solution};
 use crate::error::{Error, Result};
-use crate::exposure::Bracket;
+use crate::exposure::{Bracket, Frame};
 use crate::gpu::Gpu;
 use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::{Kernels, UNSEEN};
@@ -266,7 +266,7 @@ pub fn merge_with(
         let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
         (exposures, noise)
     });
-    let curves = frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect();
+    let curves = curves(frames, response, &noise);
     let motions = vec![DMat3::IDENTITY; frames.len()];
     let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
     let mut run = Run {
@@ -293,7 +293,12 @@ pub fn merge_with(
         scale: 1.0,
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
-    run.reconstruct(verdicts, excluded, given)
+    run.reconstruct(verdicts, excluded, given, response)
+}
+
+/// Standard deviation of each frame's channels, see [`NoiseModel::curve`].
+fn curves(frames: &[Frame], response: &Response, noise: &NoiseModel) -> Vec<[Vec<f32>; 3]> {
+    frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect()
 }
 
 fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
@@ -445,6 +450,21 @@ impl Run<'_> {
         going.map(|()| found)
     }
 
+    /// The noise level again, now that it is known that the frames `still` show the scene as it is: what a file format has made smooth could not be told
+    /// before.
+    fn measure_noise(&mut self, still: &[usize], response: &Response) {
+        let Some(&first) = still.first() else { return };
+        let alike: Vec<usize> = still.iter().copied().filter(|&i| self.motions[i] == self.motions[first]).collect();
+        if self.settings.noise.is_some() {
+            return;
+        }
+        let frames = self.bracket.frames();
+        if let Some(noise) = noise::of_squares(frames, &self.exposures, response, &alike, &self.noise) {
+            self.curves = curves(frames, response, &noise);
+            self.noise = noise;
+        }
+    }
+
     /// Motions from the frame `reference` instead.
     fn rebase(&mut self, reference: usize) {
         if self.motions[reference] == DMat3::IDENTITY {
@@ -458,7 +478,13 @@ impl Run<'_> {
         }
     }
 
-    fn reconstruct(mut self, verdicts: Vec<Verdict>, mut excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<Outcome> {
+    fn reconstruct(
+        mut self,
+        verdicts: Vec<Verdict>,
+        mut excluded: Vec<bool>,
+        given: Option<&TsfFile>,
+        response: &Response,
+    ) -> Result<Outcome> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
@@ -563,6 +589,7 @@ impl Run<'_> {
             }
         }
         let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        self.measure_noise(&still, response);
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
         let reference = self.settings.reference.or(centre).or(found).unwrap_or(0);

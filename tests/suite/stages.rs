@@ -78,6 +78,45 @@ fn texture_that_two_frames_share_is_no_noise() {
 }
 
 #[test]
+fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
+    let truth = noise::NoiseModel::from_electrons(1000.0, 6.0);
+    let (w, h) = (320, 240);
+    // What both frames show: steps of 5 pixels, too fine for a square to be without.
+    let level =
+        |x: usize, y: usize| (0.06 + 0.5 * (x as f64 / w as f64).powi(2)) * if (x / 5 + y / 5).is_multiple_of(2) { 1.0 } else { 0.85 };
+    let frame = |exposure_time: f64, seed: u64, quality: Option<u8>| {
+        let n = twelve(seed, 3 * w * h);
+        let coded = |c: usize, x: usize, y: usize| {
+            let e = exposure_time * level(x, y);
+            let z = e + truth.variance(e).sqrt() * f64::from(n[3 * (y * w + x) + c]) / 2.0;
+            (z.clamp(0.0, 1.0) * 255.0).round() as u8
+        };
+        let mut picture =
+            image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb([0, 1, 2].map(|c| coded(c, x as usize, y as usize))));
+        if let Some(quality) = quality {
+            let mut file = Vec::new();
+            picture.write_with_encoder(image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, quality)).expect("encodes");
+            picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
+        }
+        let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
+        Frame { name: "grey".into(), intensity: Rgb([plane(0), plane(1), plane(2)]), levels: 255, exposure_time }
+    };
+    for (quality, smoothed) in [(Some(75), true), (Some(90), true), (None, false)] {
+        let frames = [frame(0.4, 500, quality), frame(1.0, 600, quality)];
+        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+        let first = noise::estimate(&frames, &exposures, &Response::Linear);
+        let again = noise::of_squares(&frames, &exposures, &Response::Linear, &[1, 0], &first);
+        let ratio = |model: &noise::NoiseModel| model.variance(0.1) / truth.variance(0.1);
+        assert_eq!(again.is_some(), smoothed, "{quality:?}: {:.2} -> {:?}", ratio(&first), again.map(|m| ratio(&m)));
+        if let Some(again) = again {
+            assert!(ratio(&first) < 0.6, "{quality:?}: {:.2}", ratio(&first));
+            assert!((0.8..1.8).contains(&ratio(&again)), "{quality:?}: {:.2}", ratio(&again));
+        }
+        assert_eq!(noise::of_squares(&frames, &exposures, &Response::Linear, &[0], &first), None, "one frame has no difference");
+    }
+}
+
+#[test]
 fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     for (z, expected) in [(0.0, 0.0), (0.075, 0.5), (0.15, 1.0), (0.5, 1.0), (0.85, 1.0), (0.925, 0.5), (1.0, 0.0)] {
         assert!((mask::tukey(z, 0.3) - expected).abs() < 1e-5, "Tukey window at {z}: {}", mask::tukey(z, 0.3));
