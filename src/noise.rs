@@ -57,6 +57,17 @@ fn quantisation(response: &Response, channel: usize, levels: u32) -> impl Fn(f64
     }
 }
 
+/// Variance by `quantum` of a frame at `exposure`, or of it less `ratio` times a longer one that shows the same.
+fn rounding(quantum: &impl Fn(f64) -> f64, exposure: f64, ratio: f64) -> f64 {
+    quantum(exposure) + if ratio > 0.0 { ratio * ratio * quantum(exposure / ratio) } else { 0.0 }
+}
+
+/// The frames `ids`, each with the next longer one.
+fn pairs(frames: &[Frame], mut ids: Vec<usize>) -> Vec<(usize, usize)> {
+    ids.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
+    ids.windows(2).map(|p| (p[0], p[1])).collect()
+}
+
 /// Exposures f⁻¹(Z) of a frame.
 pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
     // Few distinct intensities: one table instead of a power per pixel.
@@ -118,6 +129,12 @@ struct Sample {
 }
 
 impl Sample {
+    /// One block at `exposure` of a frame, or of a frame less `ratio` times a longer one; 0 where it is the frame alone.
+    fn new(exposure: f64, ratio: f64, variance: f64) -> Self {
+        // The longer frame has 1/ratio times the exposure, and its variance counts ratio² times.
+        Self { exposure, shots: exposure * (1.0 + ratio), reads: 1.0 + ratio * ratio, variance, blocks: 1.0 }
+    }
+
     /// What `model` says of the variance.
     fn of(&self, model: &NoiseModel) -> f64 {
         model.shot * self.shots + model.read * self.reads
@@ -140,10 +157,7 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
         blocks.collect::<Vec<Sample>>()
     };
     let mut found = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST);
-    let mut order: Vec<usize> = (0..frames.len()).collect();
-    order.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
-    for pair in order.windows(2) {
-        let (i, j) = (pair[0], pair[1]);
+    for (i, j) in pairs(frames, (0..frames.len()).collect()) {
         let ratio = frames[i].exposure_time / frames[j].exposure_time;
         let differences = (0..3).into_par_iter().flat_map_iter(|c| {
             let less = Some((&frames[j].intensity.0[c], &exposures[j].0[c], ratio));
@@ -212,22 +226,14 @@ fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) ->
             }
             let n = (BLOCK * BLOCK) as f64;
             let (exposure, square) = (sum / n, square / n);
-            // The longer frame has 1/ratio times the exposure, and its variance counts ratio² times.
             let ratio = source.less.map_or(0.0, |l| l.2);
-            let rounding = quantum(exposure) + if ratio > 0.0 { ratio * ratio * quantum(exposure / ratio) } else { 0.0 };
-            blocks.push(Sample {
-                exposure,
-                shots: exposure * (1.0 + ratio),
-                reads: 1.0 + ratio * ratio,
-                variance: (square - rounding).max(0.0),
-                blocks: 1.0,
-            });
+            blocks.push(Sample::new(exposure, ratio, (square - rounding(quantum, exposure, ratio)).max(0.0)));
         }
     }
     blocks
 }
 
-/// That part where texture lifts samples: texture lifts samples, and only samples of few blocks fall below.
+/// Part of the flattest blocks' samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.
 const BELOW: f64 = 0.15;
 
 /// Quantile regression of variance = shot · x + read in logarithms, by search over both parameters, each step finer.

@@ -201,6 +201,7 @@ struct Run<'a> {
     memo: &'a mut Memo,
     stop: Option<Arc<AtomicBool>>,
     bracket: &'a Bracket,
+    response: &'a Response,
     settings: &'a Settings,
     exposures: Vec<Rgb>,
     masks: Vec<Plane>,
@@ -275,6 +276,7 @@ pub fn merge_with(
         memo,
         stop,
         bracket,
+        response,
         settings,
         exposures,
         masks: Vec::new(),
@@ -293,7 +295,7 @@ pub fn merge_with(
         scale: 1.0,
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
-    run.reconstruct(verdicts, excluded, given, response)
+    run.reconstruct(verdicts, excluded, given)
 }
 
 /// Standard deviation of each frame's channels, see [`NoiseModel::curve`].
@@ -452,17 +454,25 @@ impl Run<'_> {
 
     /// The noise level again, now that it is known that the frames `still` show the scene as it is: what a file format has made smooth could not be told
     /// before.
-    fn measure_noise(&mut self, still: &[usize], response: &Response) {
-        let Some(&first) = still.first() else { return };
-        let alike: Vec<usize> = still.iter().copied().filter(|&i| self.motions[i] == self.motions[first]).collect();
-        if self.settings.noise.is_some() {
-            return;
+    fn measure_noise(&mut self, still: &[usize]) -> Result<()> {
+        if self.settings.noise.is_some() || still.len() < 2 {
+            return Ok(());
         }
         let frames = self.bracket.frames();
-        if let Some(noise) = noise::of_squares(frames, &self.exposures, response, &alike, &self.noise) {
-            self.curves = curves(frames, response, &noise);
+        let noise = self.remembered(
+            "noise of sharp frames",
+            &format!("{still:?}"),
+            |_| 0,
+            |run| {
+                let alike: Vec<usize> = still.iter().copied().filter(|&i| run.motions[i] == run.motions[still[0]]).collect();
+                Ok(noise::of_squares(frames, &run.exposures, run.response, &alike, &run.noise))
+            },
+        )?;
+        if let Some(noise) = noise {
+            self.curves = curves(frames, self.response, &noise);
             self.noise = noise;
         }
+        Ok(())
     }
 
     /// Motions from the frame `reference` instead.
@@ -478,13 +488,7 @@ impl Run<'_> {
         }
     }
 
-    fn reconstruct(
-        mut self,
-        verdicts: Vec<Verdict>,
-        mut excluded: Vec<bool>,
-        given: Option<&TsfFile>,
-        response: &Response,
-    ) -> Result<Outcome> {
+    fn reconstruct(mut self, verdicts: Vec<Verdict>, mut excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<Outcome> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
@@ -589,7 +593,10 @@ impl Run<'_> {
             }
         }
         let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-        self.measure_noise(&still, response);
+        // Blurred frames that are merged as they are differ by their blurs as well.
+        if !unexplained {
+            self.measure_noise(&still)?;
+        }
         let shaken: Vec<usize> = used.iter().copied().filter(|&i| !sharp[i]).collect();
         let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&used));
         let reference = self.settings.reference.or(centre).or(found).unwrap_or(0);

@@ -1,7 +1,7 @@
 //! The noise level by the means of squares, for files whose format has made the noise smooth: JPEG drops what is finest within squares of 8 × 8
 //! pixels, here more and there less, and keeps their means.
 
-use super::{NoiseModel, Quantile, Sample, bins, clear, fit, quantisation};
+use super::{NoiseModel, Quantile, Sample, bins, clear, fit, pairs, quantisation, rounding};
 use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::response::Response;
@@ -20,9 +20,8 @@ const SMOOTHED: f64 = 1.5;
 /// The noise level of the frames `ids`, which show the same in the same place, if they have clearly more noise than `model` says: from the differences
 /// between each and the next longer one, averaged over squares, from one square to the next. `None` where `model` does well or too little is unclipped.
 pub fn of_squares(frames: &[Frame], exposures: &[Rgb], response: &Response, ids: &[usize], model: &NoiseModel) -> Option<NoiseModel> {
-    let mut order = ids.to_vec();
-    order.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
-    let samples: Vec<Sample> = order.windows(2).flat_map(|p| bins(differences(frames, exposures, response, p[0], p[1]), &MIDDLE)).collect();
+    let of_pair = |(i, j)| bins(differences(frames, exposures, response, i, j), &MIDDLE);
+    let samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
     let (mut excess, mut count) = (0.0, 0.0);
     for s in &samples {
         excess += s.blocks * (s.variance / s.of(model)).ln();
@@ -41,10 +40,9 @@ fn differences(frames: &[Frame], exposures: &[Rgb], response: &Response, i: usiz
         let columns = exposures[i].width() / SQUARE;
         let sample = |(a, b): (&(f64, f64), &(f64, f64))| {
             let exposure = 0.5 * (a.0 + b.0);
-            let rounding = quantum(exposure) + ratio * ratio * quantum(exposure / ratio);
             let square = 0.5 * (a.1 - b.1).powi(2) * (SQUARE * SQUARE) as f64;
-            let variance = (square - MIDDLE.of_noise * rounding).max(0.0);
-            Sample { exposure, shots: exposure * (1.0 + ratio), reads: 1.0 + ratio * ratio, variance, blocks: 1.0 }
+            // The quantile is divided by its part of the expectation later on.
+            Sample::new(exposure, ratio, (square - MIDDLE.of_noise * rounding(&quantum, exposure, ratio)).max(0.0))
         };
         let pair = |k: usize, next: usize| Some(sample((means[k].as_ref()?, means.get(next)?.as_ref()?)));
         let across = (0..means.len()).filter(|k| (k + 1) % columns != 0).filter_map(|k| pair(k, k + 1));
