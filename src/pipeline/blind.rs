@@ -135,6 +135,18 @@ fn stands(growth: f64, count: usize) -> bool {
     growth < if count > 1 { STOOD_STILL.1 } else { STOOD_STILL.0 }
 }
 
+/// Whether a look by which the frames `alike` stood still, residuals growing by `growth` if they are held, does not settle it: one frame alone can
+/// be held still beside the others' motion whatever it did itself, and at half its size it hardly shows. Where standing explains more, it stood.
+fn left_open(growth: f64, alike: &[usize], passing: &[usize]) -> bool {
+    alike.len() == 1 && !passing.is_empty() && growth > 1.0
+}
+
+/// Those of the frames `passing` that are asked about as they are, after a look by which residuals grow by `growth` if all of `alike` are held: none
+/// where that is clear, unless others were held with them, whose motion says nothing of theirs.
+fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] {
+    if growth < CLEAR || passing.len() < alike.len() { passing } else { &[] }
+}
+
 /// `frames` without those of `others`.
 fn without(frames: &[usize], others: &[usize]) -> Vec<usize> {
     frames.iter().copied().filter(|i| !others.contains(i)).collect()
@@ -200,7 +212,7 @@ impl Run<'_> {
         let mut growth = 0.0;
         if let Some(seen) = &seen {
             growth = self.if_still(seen, alike);
-            if stands(growth, alike.len()) {
+            if stands(growth, alike.len()) && !(seen.all_moved() && left_open(growth, alike, passing)) {
                 return Ok(AllBlurs::Sharp(alike.clone()));
             }
             let shaken = seen.beyond(alike, SURELY_SHAKEN);
@@ -229,8 +241,7 @@ impl Run<'_> {
             }
         }
         let look = seen.filter(|seen| seen.frames == used && seen.whole).map(|seen| seen.look);
-        let asked = if doubtful && growth < CLEAR { &passing[..] } else { &[] };
-        let (found, still) = self.joint(used, look, doubtful, asked, at(0.3), to)?;
+        let (found, still) = self.joint(used, look, doubtful, asked(growth, alike, passing), at(0.3), to)?;
         if found.is_some() || !doubtful {
             return Ok(or_merged(found));
         }
@@ -558,6 +569,22 @@ mod tests {
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "trails of lamps have steep edges, too");
         all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn one_frame_alone_is_asked_about_as_it_is() {
+        assert!(left_open(1.3, &[0], &[0]), "beside the others' motion it can be held whatever it did");
+        assert!(!left_open(0.9, &[0], &[0]), "standing explains more");
+        assert!(!left_open(1.3, &[0, 1], &[0, 1]), "two hold each other");
+        assert!(!left_open(1.3, &[0], &[]), "none passes for sharp");
+    }
+
+    #[test]
+    fn what_frames_held_with_them_did_says_nothing_of_the_passing_ones() {
+        assert_eq!(asked(2.5, &[0, 1], &[0, 1]), [0, 1]);
+        assert_eq!(asked(20.0, &[0, 1], &[0, 1]), [0; 0], "the look is clear about them");
+        assert_eq!(asked(20.0, &[0, 1], &[0]), [0], "what moved may be the other one");
+        assert_eq!(asked(20.0, &[0, 1], &[]), [0; 0]);
     }
 
     #[test]
