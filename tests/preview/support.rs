@@ -162,13 +162,20 @@ impl Window {
         self.harness.input_mut().dropped_files = handles.collect();
     }
 
-    /// Chooses a tone curve.
-    pub fn choose_curve(&mut self, name: &str) {
+    /// Chooses a tone curve. Returns whether one of the steps that this takes said that the picture is being computed: a small one may be
+    /// there at the next.
+    pub fn choose_curve(&mut self, name: &str) -> bool {
         let now = self.app().session().look.curve.clone();
         self.harness.get_by_value(&now).click();
         self.harness.run_steps(3);
         self.harness.get_by_label(name).click();
-        self.harness.run_steps(2);
+        let sign = format!("{name} is being computed");
+        let mut said = false;
+        for _ in 0..2 {
+            self.harness.step();
+            said |= self.harness.query_by_label_contains(&sign).is_some();
+        }
+        said
     }
 
     /// Waits for the device.
