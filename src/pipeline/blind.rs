@@ -83,8 +83,8 @@ const SLIGHTLY: (f64, f64) = (0.8, 4.0);
 const LEAST_DETAIL: f64 = 0.1;
 
 /// Steepness of the sharpest edges up to which a frame that passes for sharp may be blurred by some pixels: frames blurred by 4 px and more
-/// measure up to 0.55, sharp ones of scenes with hard edges 0.58 and more, of soft scenes from 0.39 on.
-const SURELY_STEEP: f64 = 0.57;
+/// measure up to 0.57, sharp ones of scenes with hard edges 0.58 and more, of soft scenes from 0.39 on. Being asked costs a sharp frame time alone.
+const SURELY_STEEP: f64 = 0.60;
 /// Detail up to which a frame that passes for sharp may be blurred, though another frame is surely sharp: most sharp ones measure more. At night, where
 /// little but lamps can be seen, blurred ones may do so too.
 const SURELY_DETAILED: f64 = 0.85;
