@@ -50,8 +50,11 @@ pub struct Settings {
     pub focal_px: Option<f64>,
     /// Pixels (x, y) at which to look at the blur; empty: chosen.
     pub patches: Vec<(usize, usize)>,
-    /// Largest distance in pixels, per axis, to which a local PSF reaches; `None`: as far as the frame's TSF moves the patch, and a little.
+    /// Largest distance in pixels, per axis, to which a local PSF reaches; `None`: as far as the frame's TSF moves the patch, and a little (12
+    /// for [`Blind::Patches`], where it is at most a quarter of the patch).
     pub psf_radius: Option<usize>,
+    /// Side in pixels of the patches of [`Blind::Patches`]; `None`: 120.
+    pub patch_size: Option<usize>,
     /// Noise level of the frames; `None`: estimated from them.
     pub noise: Option<NoiseModel>,
     /// What to do when no frame is sharp.
@@ -74,6 +77,7 @@ impl Default for Settings {
             focal_px: None,
             patches: Vec::new(),
             psf_radius: None,
+            patch_size: None,
             noise: None,
             blind: Blind::default(),
             between_pixels: true,
@@ -91,6 +95,7 @@ impl Settings {
             focal_px: self.focal_px.map(|f| f / divisor as f64),
             patches: self.patches.iter().map(|&(x, y)| (x / divisor, y / divisor)).collect(),
             psf_radius: self.psf_radius.map(|r| r.div_ceil(divisor)),
+            patch_size: self.patch_size.map(|s| s.div_ceil(divisor)),
             // Means of squares of pixels have less noise than the pixels.
             noise: self.noise.map(|n| NoiseModel { shot: n.shot / squares, read: n.read / squares }),
             between_pixels: self.between_pixels && divisor == 1,
@@ -561,6 +566,9 @@ impl Run<'_> {
         if merged_only {
             self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
         } else if forced || doubt.is_some() || (!all_known && !sharp.contains(&true)) {
+            if self.settings.blind == Blind::Patches {
+                self.memo.depends(&(self.settings.psf_radius, self.settings.patch_size));
+            }
             let (found, motions, blind, degraded) = self.remembered(
                 "all blurs",
                 "",

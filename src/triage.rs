@@ -24,6 +24,9 @@ pub struct Verdict {
     /// Energy of one-pixel over that of two-pixel differences, worst direction: about 0.5 where edges are one pixel wide, 0.25 where
     /// they are ramps.
     pub steepness: f64,
+    /// Least over most of that ratio among directions at right angles, the worse pair of them: a lens softens edges of all directions alike, a hand's
+    /// motion those across it. 1 where nothing tells.
+    pub evenness: f64,
     /// Why, in words.
     pub reason: String,
 }
@@ -297,14 +300,19 @@ fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, look
     DIRECTIONS.par_iter().map(along).reduce(|| [None; 2], |x, y| [least(x[0], y[0]), least(x[1], y[1])])
 }
 
-/// [`Verdict::steepness`].
-fn steepness(a: &Luminance) -> f64 {
-    let steep = DIRECTIONS.iter().filter_map(|&d| {
+/// [`Verdict::steepness`] and [`Verdict::evenness`].
+fn steepness(a: &Luminance) -> (f64, f64) {
+    let steep = DIRECTIONS.map(|d| {
         let (one, two) = (energy(a, a, &a.valid, d, 1), energy(a, a, &a.valid, d, 2));
         (two.sum > 3.0 * two.error).then(|| one.sum.max(0.0) / two.sum)
     });
-    let least = steep.fold(f64::INFINITY, f64::min);
-    if least.is_finite() { least } else { 0.5 }
+    let least = steep.into_iter().flatten().reduce(f64::min);
+    // The axes, and the diagonals: a pixel across is not a diagonal of one.
+    let even = steep.chunks(2).filter_map(|pair| match *pair {
+        [Some(a), Some(b)] if a.max(b) > 0.0 => Some(a.min(b) / a.max(b)),
+        _ => None,
+    });
+    (least.unwrap_or(0.5), even.fold(1.0, f64::min))
 }
 
 /// Sorts the frames. `given` (from the user) overrides; the numbers are reported all the same. `motions`: each frame's place, from the
@@ -319,12 +327,9 @@ pub fn triage(
 ) -> Vec<Verdict> {
     let looked = Looked::at(frames[0].intensity.size(), ENOUGH);
     let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
-    let verdict = |a: &Luminance| Verdict {
-        sharp: false,
-        detail: 1.0,
-        compared: false,
-        steepness: steepness(&a.part(&looked)),
-        reason: String::new(),
+    let verdict = |a: &Luminance| {
+        let (steepness, evenness) = steepness(&a.part(&looked));
+        Verdict { sharp: false, detail: 1.0, compared: false, steepness, evenness, reason: String::new() }
     };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.

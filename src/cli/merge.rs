@@ -462,6 +462,10 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
         let radius = word.parse().ok().filter(|r| (1..=200).contains(r));
         settings.psf_radius = Some(radius.ok_or_else(|| Usage(format!("--psf-radius: {word:?} is not a number of pixels from 1 to 200")))?);
     }
+    if let Some(word) = &args.patch_size {
+        let size = word.parse().ok().filter(|s| (16..=2000).contains(s));
+        settings.patch_size = Some(size.ok_or_else(|| Usage(format!("--patch-size: {word:?} is not a number of pixels from 16 to 2000")))?);
+    }
     let number = |option: &str, word: &Option<String>, (low, high): (f32, f32)| match word {
         None => Ok(None),
         Some(word) => match word.parse::<f32>().ok().filter(|v| (low..=high).contains(v)) {
@@ -486,6 +490,17 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     settings.blind = blind(args.blind.as_deref())?;
     if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {
         return Err(Usage(format!("--blind {word} estimates the TSFs that --tsf gives; leave one of them out")));
+    }
+    if settings.blind == Blind::Patches {
+        let (radius, side) = (settings.psf_radius.unwrap_or(0), settings.patch_setup().side);
+        if 4 * radius > side {
+            return Err(Usage(format!(
+                "--psf-radius {radius} is more than a quarter of a patch of {side} pixels; give --patch-size {} or more as well",
+                4 * radius
+            )));
+        }
+    } else if settings.patch_size.is_some() {
+        return Err(Usage("--patch-size belongs to --blind patches; give both or none".into()));
     }
     let name = |i: usize| format!("frame {} ({})", i + 1, args.frames[i].display());
     if let Some(i) = settings.exclude.iter().find(|i| settings.sharp.as_ref().is_some_and(|s| s.contains(i))) {

@@ -1,6 +1,6 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
-use super::{Event, Run};
+use super::{Event, Run, Settings};
 use crate::blind::{self, Frame, Lack, Look, PatchSetup, Start};
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
@@ -73,6 +73,27 @@ pub(super) struct Doubt {
     frames: Vec<usize>,
     /// Those of them that pass for sharp.
     passing: Vec<usize>,
+    /// Those of them whose edges are softer in one direction than across it.
+    uneven: Vec<usize>,
+}
+
+impl Doubt {
+    /// Whether the frames `still` did not move, if residuals grow by `growth` when they are held.
+    fn stands(&self, growth: f64, still: &[usize]) -> bool {
+        growth
+            < match still {
+                [one] if self.uneven.contains(one) => STOOD_STILL.uneven,
+                [_] => STOOD_STILL.alone,
+                _ => STOOD_STILL.together,
+            }
+    }
+
+    /// Whether a look by which the frames in doubt stood still, residuals growing by `growth` if they are held, does not settle it: one frame alone can
+    /// be held still beside the others' motion whatever it did itself, and at half its size it hardly shows. Where standing explains more, it stood,
+    /// unless its edges say otherwise.
+    fn leaves_open(&self, growth: f64) -> bool {
+        self.frames.len() == 1 && !self.passing.is_empty() && (growth > 1.0 || !self.uneven.is_empty())
+    }
 }
 
 /// Held-out χ² of the joint estimate over that of the merge below which it is believed.
@@ -90,9 +111,21 @@ const SURELY_STEEP: f64 = 0.60;
 const SURELY_DETAILED: f64 = 0.85;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
-/// Growth of the residuals, if a frame alone or several did not move, up to which they did not: sharp frames in place and displaced measure up to 1.3
-/// and 1.5, frames blurred by 4 px and more from 1.7 and 2.9 on.
-const STOOD_STILL: (f64, f64) = (1.5, 2.0);
+/// Growth of the residuals, if frames did not move, up to which they did not.
+struct StoodStill {
+    /// Of one frame whose edges are uneven.
+    uneven: f64,
+    /// Of one frame.
+    alone: f64,
+    /// Of several.
+    together: f64,
+}
+
+/// Sharp frames in place and displaced measure up to 1.3 alone and 1.5 together, frames blurred by 4 px and more from 1.5 and 2.9 on, and 1.25 where
+/// what the others did contains the one's motion.
+const STOOD_STILL: StoodStill = StoodStill { uneven: 1.2, alone: 1.5, together: 2.0 };
+/// Evenness up to which edges are softer in one direction than across it: sharp frames measure 0.89 and more.
+const UNEVEN: f64 = 0.86;
 /// Growth at the look above which the frames as they are, which tell more, need not be asked.
 const CLEAR: f64 = 5.0;
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
@@ -119,7 +152,8 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
     if frames.is_empty() || frames.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
         return None;
     }
-    Some(Doubt { passing: frames.iter().copied().filter(|&i| sharp[i]).collect(), frames })
+    let of = |is: &dyn Fn(usize) -> bool| frames.iter().copied().filter(|&i| is(i)).collect();
+    Some(Doubt { passing: of(&|i| sharp[i]), uneven: of(&|i| verdicts[i].evenness < UNEVEN), frames })
 }
 
 /// Frames that pass for sharp with little to spare, and the others that do, where one of those surely is: a steep edge of one frame says nothing
@@ -128,17 +162,6 @@ pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]
     let passing = used.iter().copied().filter(|&i| sharp[i]);
     let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED);
     if sure.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
-}
-
-/// Whether `count` frames stood still, if residuals grow so much when they are held.
-fn stands(growth: f64, count: usize) -> bool {
-    growth < if count > 1 { STOOD_STILL.1 } else { STOOD_STILL.0 }
-}
-
-/// Whether a look by which the frames `alike` stood still, residuals growing by `growth` if they are held, does not settle it: one frame alone can
-/// be held still beside the others' motion whatever it did itself, and at half its size it hardly shows. Where standing explains more, it stood.
-fn left_open(growth: f64, alike: &[usize], passing: &[usize]) -> bool {
-    alike.len() == 1 && !passing.is_empty() && growth > 1.0
 }
 
 /// Those of the frames `passing` that are asked about as they are, after a look by which residuals grow by `growth` if all of `alike` are held: none
@@ -150,6 +173,16 @@ fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] 
 /// `frames` without those of `others`.
 fn without(frames: &[usize], others: &[usize]) -> Vec<usize> {
     frames.iter().copied().filter(|i| !others.contains(i)).collect()
+}
+
+impl Settings {
+    /// How [`Blind::Patches`] looks at the patches.
+    pub(crate) fn patch_setup(&self) -> PatchSetup {
+        let usual = PatchSetup::default();
+        let side = self.patch_size.unwrap_or(usual.side);
+        let radius = self.psf_radius.unwrap_or(usual.pair.radius).clamp(1, (side / 4).max(1));
+        PatchSetup { side, pair: psf::Setup { radius, ..usual.pair }, ..usual }
+    }
 }
 
 impl Run<'_> {
@@ -205,21 +238,21 @@ impl Run<'_> {
         if self.settings.blind == Blind::Patches {
             return Ok(or_merged(self.patches(used, from, to)?));
         }
-        let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, false, &[], from, to)?.0)) };
-        let Doubt { frames: alike, passing } = doubt;
+        let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, None, &[], from, to)?.0)) };
+        let Doubt { frames: alike, passing, .. } = doubt;
         let frames = if alike.len() > 1 { alike } else { used };
         let mut seen = self.look(frames, from, at(0.2))?;
         let mut growth = 0.0;
         if let Some(seen) = &seen {
             growth = self.if_still(seen, alike);
-            if stands(growth, alike.len()) && !(seen.all_moved() && left_open(growth, alike, passing)) {
+            if doubt.stands(growth, alike) && !(seen.all_moved() && doubt.leaves_open(growth)) {
                 return Ok(AllBlurs::Sharp(alike.clone()));
             }
             let shaken = seen.beyond(alike, SURELY_SHAKEN);
             let still = without(alike, &shaken);
             // One alone stands still beside another's motion, whatever it did itself.
             let tells = still.len() > 1 || (still.len() == 1 && frames.len() == used.len());
-            if !shaken.is_empty() && tells && stands(self.if_still(seen, &still), still.len()) {
+            if !shaken.is_empty() && tells && doubt.stands(self.if_still(seen, &still), &still) {
                 return self.settled(alike, shaken);
             }
         }
@@ -232,7 +265,7 @@ impl Run<'_> {
                 // One alone stands still beside another's motion, whatever it did itself: the others tell.
                 seen = self.look(used, at(0.2), at(0.3))?;
                 none_still = match &seen {
-                    Some(seen) => seen.all_moved() && !stands(self.if_still(seen, &still), still.len()),
+                    Some(seen) => seen.all_moved() && !doubt.stands(self.if_still(seen, &still), &still),
                     None => false,
                 };
             }
@@ -241,7 +274,7 @@ impl Run<'_> {
             }
         }
         let look = seen.filter(|seen| seen.frames == used && seen.whole).map(|seen| seen.look);
-        let (found, still) = self.joint(used, look, doubtful, asked(growth, alike, passing), at(0.3), to)?;
+        let (found, still) = self.joint(used, look, doubtful.then_some(doubt), asked(growth, alike, passing), at(0.3), to)?;
         if found.is_some() || !doubtful {
             return Ok(or_merged(found));
         }
@@ -394,8 +427,9 @@ impl Run<'_> {
         let times = |k: &usize| self.bracket.frames()[used[*k]].exposure_time;
         let shortest = (0..used.len()).min_by(|a, b| times(a).total_cmp(&times(b))).unwrap_or(0);
         let reference = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)).unwrap_or(shortest);
+        let setup = self.settings.patch_setup();
         let events = &mut self.events;
-        let found = blind::from_patches(&frames, reference, &PatchSetup::default(), &mut |f| {
+        let found = blind::from_patches(&frames, reference, &setup, &mut |f| {
             events(Event::Progress { stage: "estimating the blurs of pairs of patches".into(), fraction: from + 0.9 * (to - from) * f })
         });
         let name = |k: usize| self.bracket.frames()[used[k]].name.clone();
@@ -432,13 +466,13 @@ impl Run<'_> {
         Ok(Some(Found { start, tsfs: found.tsfs, reference: used[reference], reduced: false }))
     }
 
-    /// The joint estimate, after `look` at all of the frames where there was one. Where it is `doubtful` whether all moved, it is believed only if it
+    /// The joint estimate, after `look` at all of the frames where there was one. Where there is `doubt` whether all moved, it is believed only if it
     /// finds that they did, and that those `asked` about are not explained as well if they did not; otherwise the frames that hardly moved.
     fn joint(
         &mut self,
         used: &[usize],
         look: Option<Look>,
-        doubtful: bool,
+        doubt: Option<&Doubt>,
         asked: &[usize],
         from: f32,
         to: f32,
@@ -448,6 +482,7 @@ impl Run<'_> {
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
         let places: Vec<usize> = (0..used.len()).filter(|&k| asked.contains(&used[k])).collect();
+        let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
@@ -462,7 +497,8 @@ impl Run<'_> {
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
         let moved: Vec<usize> = used.iter().zip(&extents).filter(|(_, e)| **e > SHAKEN).map(|(i, _)| *i).collect();
         // The frames as they are tell more than a look at half their size.
-        let stood_still = !places.is_empty() && stands(found.if_still, places.len());
+        let held: Vec<usize> = places.iter().map(|&k| used[k]).collect();
+        let stood_still = !held.is_empty() && doubt.is_some_and(|doubt| doubt.stands(found.if_still, &held));
         let believed = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
         self.blind = json!({
             "method": "joint",
@@ -556,7 +592,7 @@ mod tests {
     use super::*;
 
     fn verdict(detail: f64, steepness: f64, sharp: bool) -> Verdict {
-        Verdict { sharp, detail, compared: true, steepness, reason: String::new() }
+        Verdict { sharp, detail, compared: true, steepness, evenness: 1.0, reason: String::new() }
     }
 
     #[test]
@@ -573,10 +609,25 @@ mod tests {
 
     #[test]
     fn one_frame_alone_is_asked_about_as_it_is() {
-        assert!(left_open(1.3, &[0], &[0]), "beside the others' motion it can be held whatever it did");
-        assert!(!left_open(0.9, &[0], &[0]), "standing explains more");
-        assert!(!left_open(1.3, &[0, 1], &[0, 1]), "two hold each other");
-        assert!(!left_open(1.3, &[0], &[]), "none passes for sharp");
+        let doubt = |frames: &[usize], passing: &[usize], uneven: &[usize]| Doubt {
+            frames: frames.to_vec(),
+            passing: passing.to_vec(),
+            uneven: uneven.to_vec(),
+        };
+        assert!(doubt(&[0], &[0], &[]).leaves_open(1.3), "beside the others' motion it can be held whatever it did");
+        assert!(!doubt(&[0], &[0], &[]).leaves_open(0.9), "standing explains more");
+        assert!(doubt(&[0], &[0], &[0]).leaves_open(0.9), "edges of one direction are softer, all the same");
+        assert!(!doubt(&[0, 1], &[0, 1], &[0]).leaves_open(1.3), "two hold each other");
+        assert!(!doubt(&[0], &[], &[0]).leaves_open(1.3), "none passes for sharp");
+    }
+
+    #[test]
+    fn a_frame_whose_edges_are_uneven_has_less_to_show_for_having_moved() {
+        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2] };
+        assert!(doubt.stands(1.3, &[0]) && !doubt.stands(1.3, &[1]));
+        assert!(doubt.stands(1.1, &[1]), "its residuals hardly grow");
+        assert!(!doubt.stands(1.6, &[0]));
+        assert!(doubt.stands(1.9, &[0, 1]) && doubt.stands(1.9, &[1, 2]) && !doubt.stands(2.1, &[0, 1]), "frames hold each other");
     }
 
     #[test]

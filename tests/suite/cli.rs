@@ -135,6 +135,9 @@ fn wrong_options_are_usage_errors() {
         ("merge -o x.exr --exposures 1,2 --patch 12 a.png b.png", 2, &["--patch", "120,80"]),
         ("merge -o x.exr --exposures 1,2 --blind never a.png b.png", 2, &["--blind", "auto, joint, patches nor off"]),
         ("merge -o x.exr --exposures 1,2 --blind patches --tsf tsf.json a.png b.png", 2, &["--blind patches", "--tsf", "leave one"]),
+        ("merge -o x.exr --exposures 1,2 --patch-size 96 a.png b.png", 2, &["--patch-size", "--blind patches"]),
+        ("merge -o x.exr --exposures 1,2 --blind patches --patch-size 8 a.png b.png", 2, &["--patch-size", "from 16"]),
+        ("merge -o x.exr --exposures 1,2 --blind patches --psf-radius 40 a.png b.png", 2, &["--psf-radius 40", "--patch-size 160"]),
         ("merge -o x.exr --exposures 1,2 --blind joint --tsf tsf.json a.png b.png", 2, &["--blind joint", "--tsf", "leave one"]),
         ("merge -o x.exr --exposures 1,2 --alpha 1.5 a.png b.png", 2, &["--alpha", "from 0 to 1"]),
         ("merge -o x.exr --exposures 1,2 --noise 4000 a.png b.png", 2, &["--noise", "\"4000\"", "12000,6"]),
@@ -462,6 +465,12 @@ fn the_papers_path_runs_on_request() {
     let patches = report["blind"]["patches"].as_array().unwrap();
     assert!(patches.len() == 3 && patches.iter().all(|f| !f["psfs"].as_array().unwrap().is_empty()), "{}", report["blind"]);
     assert!(column(&report, "tsf").iter().all(|t| t["poses"].as_array().is_some_and(|p| !p.is_empty())));
+    // Sizes are free.
+    let (_, _, report, said) = merge_tiny(dir.path(), "smaller", &["--blind", "patches", "--patch-size", "48", "--psf-radius", "9"]);
+    let patches = report["blind"]["patches"].as_array().unwrap_or_else(|| panic!("{said}"));
+    for psf in patches.iter().flat_map(|f| f["psfs"].as_array().unwrap()) {
+        assert!(psf["size"] == 48 && psf["radius"] == 9 && psf["values"].as_array().unwrap().len() == 19 * 19, "{psf}");
+    }
 }
 
 /// Camera files, their own curve: window and desk of the office, at half size to be quick.

@@ -338,3 +338,39 @@ fn shaken_frames_are_told_from_sharp_ones() {
         assert_eq!(found.iter().map(|v| !v.sharp).collect::<Vec<_>>(), shaken, "{found:?}");
     }
 }
+
+/// Discs have edges of all directions. A lens softens them alike, a motion those across it.
+#[test]
+fn edges_are_even_behind_a_soft_lens_and_uneven_after_a_motion() {
+    let level = noise::NoiseModel::from_electrons(1e6, 1.0);
+    let (w, h) = (128, 96);
+    let discs = numbers(5, 3 * 80);
+    let scene = Plane::from_fn(w, h, |x, y| {
+        let disc = discs.chunks(3).rposition(|d| {
+            let (u, v) = (x as f32 - 64.0 * (1.0 + d[0]), y as f32 - 48.0 * (1.0 + d[1]));
+            u * u + v * v < (9.0 + 6.0 * d[2]).powi(2)
+        });
+        0.1 + 0.01 * disc.unwrap_or(0) as f32
+    });
+    // Means over pixels away by (x, y).
+    let mean = |plane: &Plane, at: &[(isize, isize)]| {
+        let of = |x: usize, y: usize| at.iter().map(|(i, j)| plane.clamped(x as isize + i, y as isize + j)).sum::<f32>() / at.len() as f32;
+        Plane::from_fn(w, h, of)
+    };
+    let along = |dx: isize, dy: isize, reach: isize| (-reach..=reach).map(|k| (dx * k, dy * k)).collect::<Vec<_>>();
+    let soft = mean(&mean(&scene, &along(1, 0, 1)), &along(0, 1, 1));
+    let moved = [(1, 0), (0, 1), (1, 1), (1, -1)].map(|(dx, dy)| mean(&scene, &along(dx, dy, 1)));
+    let of = |plane: &Plane| {
+        let intensity = Rgb([plane.clone(), plane.clone(), plane.clone()]);
+        let frame = Frame { name: String::new(), intensity, levels: 65535, exposure_time: 1.0 };
+        let exposures = [noise::exposure(&frame, &Response::Linear)];
+        let found = triage::triage(&[frame], &exposures, &level, &[false], None, &[DMat3::IDENTITY]);
+        (found[0].evenness, found[0].steepness)
+    };
+    let (hard, soft) = (of(&scene), of(&soft));
+    assert!(hard.0 > 0.92 && soft.0 > 0.92, "{hard:?} {soft:?}");
+    assert!(soft.1 < 0.75 * hard.1, "the lens takes steepness all the same: {hard:?} {soft:?}");
+    for moved in &moved {
+        assert!(of(moved).0 < 0.82, "{:?}", of(moved));
+    }
+}
