@@ -106,11 +106,11 @@ pub(super) struct MergeArgs {
     /// Look at the blur around this pixel, for the report; may be given several times [default: nine places are chosen]
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true)]
     pub patch: Vec<String>,
-    /// Largest reach in pixels of the local blurs (PSFs) that the report shows, and that --blind patches looks for [default: as far as the camera's
-    /// motion takes the place; 12 for --blind patches, at most a quarter of the patch]
+    /// Largest reach in pixels of the local blurs (PSFs) in the report, and of those of pairs of patches [default: as far as the camera's motion
+    /// takes the place; of pairs of patches 12, at most a quarter of a patch]
     #[arg(long, value_name = "R", allow_hyphen_values = true)]
     pub psf_radius: Option<String>,
-    /// Side in pixels of the patches of --blind patches [default: 120]
+    /// Side in pixels of the patches from pairs of which blurs are found (blind: patches) [default: 120]
     #[arg(long, value_name = "PIXELS", allow_hyphen_values = true)]
     pub patch_size: Option<String>,
     /// What the picture is taken to look like: collaborative (patches that look alike are freed of noise together), tv (few edges: total variation alone)
