@@ -665,7 +665,8 @@ impl Run<'_> {
         self.memo.depends(&(self.settings.model, self.settings.focal_px));
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
         let mut slight = Vec::new();
-        if doubt.is_some() && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
+        let doubted = doubt.is_some() || (may_doubt && blind::less_detailed(&verdicts, &used));
+        if doubted && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
             let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
             let (found, blind) = self.remembered(
                 "slight blur",

@@ -8,7 +8,7 @@ use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
 use crate::random::Random;
 use crate::tsf::{self, Tsf, WholeFrame};
-use glam::DMat3;
+use glam::{DMat2, DMat3};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -64,7 +64,6 @@ pub struct Way {
 }
 
 /// What was found once frames that were taken for sharp might move.
-#[derive(Clone, Debug)]
 pub struct Freed {
     /// See [`Joint::tsfs`].
     pub tsfs: Vec<Tsf>,
@@ -76,6 +75,20 @@ pub struct Freed {
     pub extents: Vec<f64>,
     /// Held-out residuals (geometric mean over the frames) over those with the frames held still.
     pub left: f64,
+    /// By how much the blurs of the frames set free differ from each other (most of two), that of one alone from a round one: the norm (Frobenius) of
+    /// the difference of the covariances of their translations over the sum of both traces, 0 for blurs alike. A lens, and what a scene
+    /// has of it for the smoothness that is asked of it, blurs all frames alike and in all directions or nearly so; hands do not.
+    pub unlike: f64,
+    seen: Look,
+    /// The frames set free.
+    free: Vec<usize>,
+}
+
+impl Freed {
+    /// By how much the residuals of all frames (geometric mean) grow if those set free did not move after all, everything else following from there.
+    pub fn if_still(&self) -> f64 {
+        self.seen.if_still(&self.free)
+    }
 }
 
 /// A way to begin.
@@ -115,7 +128,7 @@ const DRAWN: (usize, f32) = (15, 1.5);
 const REFINED: (usize, usize) = (4, 8);
 /// Rounds after which frames that were held still have moved as far as they will, and those after which it is seen whether they move at all:
 /// whether the residuals fall below this part of what they were.
-const FREED: (usize, usize, f64) = (6, 3, 0.93);
+const FREED: (usize, usize, f64) = (6, 3, 0.97);
 /// Rounds of luminance and TSFs under the assumption that frames did not move.
 const STILLED: usize = 4;
 /// Seed of the draws.
@@ -583,6 +596,20 @@ pub fn estimate(
     Some(Joint { luminance, tsfs, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
 }
 
+/// See [`Freed::unlike`], of blurs with the covariances `spreads`.
+fn unlike(spreads: &[DMat2]) -> f64 {
+    let trace = |m: &DMat2| m.x_axis.x + m.y_axis.y;
+    let norm = |m: DMat2| (m.x_axis.length_squared() + m.y_axis.length_squared()).sqrt();
+    let over = |difference: DMat2, light: f64| if light > 0.0 { norm(difference) / light } else { 0.0 };
+    match spreads {
+        [one] => over(*one - DMat2::IDENTITY * (0.5 * trace(one)), trace(one)),
+        _ => {
+            let pairs = spreads.iter().enumerate().flat_map(|(i, a)| spreads[..i].iter().map(move |b| (a, b)));
+            pairs.map(|(a, b)| over(*a - *b, trace(a) + trace(b))).fold(0.0, f64::max)
+        }
+    }
+}
+
 /// What the blurs of all `frames` become where those taken for sharp, `still`, may have moved as well: from the scene as these show it, `latent`, and
 /// the TSFs that follow from it, `tsfs`, of which the frame `reference` lies about the identity. TSFs are fitted to drawn scenes: the best one
 /// has the blur that those frames share, and under it they stand still. From nearby that finds a blur of a pixel or two, which the coarse
@@ -625,5 +652,7 @@ pub fn freed(
         settled(&state)
     };
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
-    Some(Freed { tsfs, luminance, scale, extents: level.extents(&state), left })
+    let spreads: Vec<DMat2> = still.iter().map(|&k| tsfs[k].covariance()).collect();
+    let (extents, unlike) = (level.extents(&state), unlike(&spreads));
+    Some(Freed { tsfs, luminance, scale, extents, left, unlike, seen: Look { level, state }, free: still.to_vec() })
 }

@@ -135,9 +135,26 @@ const SURELY_SHAKEN: f64 = 3.0;
 /// Extent beside the frames that stand still, as they are, from which that is confirmed: between the two, since their noise widens it.
 const CONFIRMED: f64 = 2.25;
 
-/// Residuals, once frames that were taken for sharp may move, over those before, up to which they did: sharp ones measure 0.77 and more, frames of 1.5
-/// and 2 px 0.60 to 0.71 (up to 0.84 among burnt-out lights).
-const SET_FREE: f64 = 0.73;
+/// Detail below which a frame that passes for sharp may have moved by a pixel or two, though an edge of it or of another is surely steep: sharp ones in
+/// place mostly measure 1. Being asked costs a sharp frame time alone.
+const LESS_DETAILED: f64 = 0.9;
+
+/// What frames have to show, once those that were taken for sharp may move, for that to be believed.
+struct SetFree {
+    /// Residuals over those before, at most.
+    left: f64,
+    /// [`blind::Freed::unlike`], at least.
+    unlike: f64,
+    /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
+    growth: f64,
+}
+
+/// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.76 and more, but for a soft lens, 0.65 and a
+/// blur that is round (0.08).
+const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25, growth: 1.05 };
+/// Where several were: sharp ones leave 0.94 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
+/// to 0.87 and differ by 0.18 and more.
+const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12, growth: 1.05 };
 
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
@@ -163,6 +180,11 @@ pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]
     let passing = used.iter().copied().filter(|&i| sharp[i]);
     let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED);
     if sure.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
+}
+
+/// Whether one of the frames `used` that passes for sharp has a little less fine structure than another: those that do not may have moved a little as well.
+pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
+    used.iter().map(|&i| &verdicts[i]).any(|v| v.sharp && v.compared && v.detail < LESS_DETAILED)
 }
 
 /// Those of the frames `passing` that are asked about as they are, after a look by which residuals grow by `growth` if all of `alike` are held: none
@@ -498,8 +520,7 @@ impl Run<'_> {
         let explained = joint < EXPLAINED * alone || (joint < SLIGHTLY.0 * alone && joint < SLIGHTLY.1);
         let moved: Vec<usize> = used.iter().zip(&extents).filter(|(_, e)| **e > SHAKEN).map(|(i, _)| *i).collect();
         // The frames as they are tell more than a look at half their size.
-        let held: Vec<usize> = places.iter().map(|&k| used[k]).collect();
-        let stood_still = !held.is_empty() && doubt.is_some_and(|doubt| doubt.stands(found.if_still, &held));
+        let stood_still = !asked.is_empty() && doubt.is_some_and(|doubt| doubt.stands(found.if_still, asked));
         let believed = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
         self.blind = json!({
             "method": "joint",
@@ -537,8 +558,9 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// The TSFs of all of the frames `used` and a scene to start from if the frames `still` among them, which were in doubt and taken for sharp, moved
-    /// by a pixel or two: if that explains all frames better by far than the TSFs `tsfs` found while they stood, and leaves none of them standing.
+    /// The TSFs of all of the frames `used` and a scene to start from if the frames `still` among them, which were taken for sharp in doubt, moved by
+    /// a pixel or two: if that explains all frames better than the TSFs `tsfs` found while they stood, by more than a harder scene behind a softer
+    /// lens, which blurs them alike.
     pub(super) fn set_free(
         &mut self,
         used: &[usize],
@@ -554,12 +576,26 @@ impl Run<'_> {
         let places: Vec<usize> = (0..used.len()).filter(|&k| still.contains(&used[k])).collect();
         let events = &mut self.events;
         let found = blind::freed(&frames, &latent.mean_of(channels), &known, &places, centre, &mut |s| {
-            let stage = "no frame is surely sharp: looking whether all moved a little".into();
+            let stage = "looking whether frames that seem sharp moved a little".into();
             events(Event::Progress { stage, fraction: 0.38 + 0.02 * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
-        let believed = found.left < SET_FREE && places.iter().all(|&k| found.extents[k] > SHAKEN);
-        self.blind["set_free"] = json!({ "believed": believed, "residual_left": found.left, "extent_px": found.extents });
+        let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
+        let moved = places.iter().any(|&k| found.extents[k] > SHAKEN);
+        let likely = moved && found.left < line.left && found.unlike > line.unlike;
+        let growth = likely.then(|| found.if_still());
+        let believed = growth.is_some_and(|growth| growth > line.growth);
+        if self.blind.is_null() {
+            // No look was taken before: one frame at least has surely steep edges.
+            self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true });
+        }
+        self.blind["set_free"] = json!({
+            "believed": believed,
+            "residual_left": found.left,
+            "unlike": found.unlike,
+            "residual_if_still": growth,
+            "extent_px": found.extents,
+        });
         if !believed {
             return Ok(None);
         }
@@ -606,6 +642,16 @@ mod tests {
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "trails of lamps have steep edges, too");
         all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn a_frame_a_little_less_fine_than_another_may_have_moved_a_little() {
+        let uncompared = Verdict { compared: false, ..verdict(0.5, 0.5, true) };
+        let all = [verdict(1.0, 0.7, true), verdict(0.87, 0.7, true), uncompared, verdict(0.4, 0.3, false)];
+        assert!(less_detailed(&all, &[0, 1]));
+        assert!(!less_detailed(&all, &[0, 3]), "the other one does not pass for sharp");
+        assert!(!less_detailed(&all, &[0]), "the other one is not in use");
+        assert!(!less_detailed(&all, &[0, 2]), "nothing says that it is less fine than another");
     }
 
     #[test]

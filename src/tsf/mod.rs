@@ -21,7 +21,7 @@ pub use whole_frame::WholeFrame;
 
 use crate::error::{Error, Result};
 use crate::pose::Pose;
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat2, DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -138,6 +138,16 @@ impl Tsf {
             m.theta_z_deg += p.weight * p.theta_z_deg;
         }
         m
+    }
+
+    /// Weighted covariance of (t_x, t_y), square pixels: where the image's centre goes, about the mean of that.
+    pub fn covariance(&self) -> DMat2 {
+        let mean = self.mean();
+        let one = |p: &Pose| {
+            let d = DVec2::new(p.t_x - mean.t_x, p.t_y - mean.t_y);
+            DMat2::from_cols(d * d.x, d * d.y) * p.weight
+        };
+        self.poses.iter().map(one).fold(DMat2::ZERO, |sum, m| sum + m)
     }
 }
 

@@ -279,6 +279,25 @@ fn frames_set_free_move_if_they_did() {
         error(&both)
     );
     assert!(stood.extents[..2].iter().all(|e| *e < 1.0), "moved by {:.2?} px where nothing moved", stood.extents);
+    // A lens that is soft in all directions alike, its scene without the smoothness that is asked of scenes: blur, but none that tells the frames apart.
+    let lens = |base: &Tsf| {
+        let around = [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (0.0, 0.0)].map(|(x, y)| Pose::planar(x, y, 0.0, 0.2));
+        Tsf::new(150.0, around.to_vec()).unwrap().about(base.base)
+    };
+    let soft = freed(&[lens(&placed[0]), lens(&placed[1]), long.clone()], &placed);
+    println!(
+        "unlike {:.2} {:.2}, {:.2} behind a lens of {:.2?} px; if still {:.2} {:.2}, {:.2}",
+        moved.unlike,
+        both.unlike,
+        soft.unlike,
+        soft.extents,
+        moved.if_still(),
+        both.if_still(),
+        soft.if_still()
+    );
+    assert!(soft.left < 0.6 && soft.extents[..2].iter().all(|e| *e > 1.0), "{:.2} left, {:.2?} px", soft.left, soft.extents);
+    assert!(soft.unlike < 0.12 && moved.unlike > 0.3 && both.unlike > 0.3, "{:.2}, {:.2} {:.2}", soft.unlike, moved.unlike, both.unlike);
+    assert!(moved.if_still() > 1.2 && both.if_still() > 1.2, "{:.2} {:.2}", moved.if_still(), both.if_still());
     for found in [&moved, &both] {
         assert!(found.left < 0.6, "{:.2} left", found.left);
         for (k, tsf) in slight.iter().enumerate() {

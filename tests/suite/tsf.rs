@@ -272,3 +272,16 @@ fn a_patch_around_a_pixel_stays_inside() {
         assert!(p.score > 0.0);
     }
 }
+
+#[test]
+fn the_covariance_of_a_motion_is_that_of_its_path() {
+    let poses = [(1.0, 2.0, 1.0), (3.0, 2.0, 1.0), (2.0, 5.0, 2.0)].map(|(x, y, w)| Pose::planar(x, y, 0.7 * x, w));
+    let found = Tsf::new(200.0, poses.to_vec()).unwrap().covariance();
+    // About (2, 3.5), weights of a quarter, a quarter and a half.
+    let truth = glam::DMat2::from_cols_array(&[0.5, 0.0, 0.0, 2.25]);
+    assert!(found.abs_diff_eq(truth, 1e-12), "{found:?}");
+    let turned = [(0.0, 0.0), (1.0, 1.0)].map(|(x, y)| Pose::planar(x, y, 0.0, 1.0));
+    let found = Tsf::new(200.0, turned.to_vec()).unwrap().covariance();
+    assert!(found.abs_diff_eq(glam::DMat2::from_cols_array(&[0.25; 4]), 1e-12), "{found:?}");
+    assert_eq!(Tsf::identity().covariance(), glam::DMat2::ZERO);
+}
