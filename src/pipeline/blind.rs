@@ -152,8 +152,8 @@ struct SetFree {
 /// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.76 and more, but for a soft lens, 0.65 and a
 /// blur that is round (0.08).
 const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25, growth: 1.05 };
-/// Where several were: sharp ones leave 0.94 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
-/// to 0.87 and differ by 0.18 and more.
+/// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
+/// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
 const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12, growth: 1.05 };
 
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
