@@ -8,7 +8,8 @@ use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
 use crate::random::Random;
 use crate::tsf::{self, Tsf, WholeFrame};
-use glam::{DMat2, DMat3};
+use glam::DMat3;
+use nalgebra::Matrix2;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -597,15 +598,13 @@ pub fn estimate(
 }
 
 /// See [`Freed::unlike`], of blurs with the covariances `spreads`.
-fn unlike(spreads: &[DMat2]) -> f64 {
-    let trace = |m: &DMat2| m.x_axis.x + m.y_axis.y;
-    let norm = |m: DMat2| (m.x_axis.length_squared() + m.y_axis.length_squared()).sqrt();
-    let over = |difference: DMat2, light: f64| if light > 0.0 { norm(difference) / light } else { 0.0 };
+fn unlike(spreads: &[Matrix2<f64>]) -> f64 {
+    let over = |difference: Matrix2<f64>, light: f64| if light > 0.0 { difference.norm() / light } else { 0.0 };
     match spreads {
-        [one] => over(*one - DMat2::IDENTITY * (0.5 * trace(one)), trace(one)),
+        [one] => over(one - Matrix2::identity() * (0.5 * one.trace()), one.trace()),
         _ => {
             let pairs = spreads.iter().enumerate().flat_map(|(i, a)| spreads[..i].iter().map(move |b| (a, b)));
-            pairs.map(|(a, b)| over(*a - *b, trace(a) + trace(b))).fold(0.0, f64::max)
+            pairs.map(|(a, b)| over(a - b, a.trace() + b.trace())).fold(0.0, f64::max)
         }
     }
 }
@@ -652,7 +651,7 @@ pub fn freed(
         settled(&state)
     };
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
-    let spreads: Vec<DMat2> = still.iter().map(|&k| tsfs[k].covariance()).collect();
+    let spreads: Vec<Matrix2<f64>> = still.iter().map(|&k| Matrix2::from_column_slice(&tsfs[k].covariance().to_cols_array())).collect();
     let (extents, unlike) = (level.extents(&state), unlike(&spreads));
     Some(Freed { tsfs, luminance, scale, extents, left, unlike, seen: Look { level, state }, free: still.to_vec() })
 }

@@ -145,16 +145,16 @@ struct SetFree {
     left: f64,
     /// [`blind::Freed::unlike`], at least.
     unlike: f64,
-    /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
-    growth: f64,
 }
 
 /// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.76 and more, but for a soft lens, 0.65 and a
 /// blur that is round (0.08).
-const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25, growth: 1.05 };
+const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25 };
 /// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
-const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12, growth: 1.05 };
+const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12 };
+/// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
+const COSTS: f64 = 1.05;
 
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
@@ -191,6 +191,11 @@ pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
 /// where that is clear, unless others were held with them, whose motion says nothing of theirs.
 fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] {
     if growth < CLEAR || passing.len() < alike.len() { passing } else { &[] }
+}
+
+/// Positions of `some` among `frames`.
+fn places(some: &[usize], frames: &[usize]) -> Vec<usize> {
+    (0..frames.len()).filter(|&k| some.contains(&frames[k])).collect()
 }
 
 /// `frames` without those of `others`.
@@ -315,7 +320,7 @@ impl Run<'_> {
 
     /// By how much the residuals of all frames looked at grow if the frames `still` of them did not move.
     fn if_still(&mut self, seen: &Seen, still: &[usize]) -> f64 {
-        let places: Vec<usize> = (0..seen.frames.len()).filter(|&k| still.contains(&seen.frames[k])).collect();
+        let places = places(still, &seen.frames);
         let growth = seen.look.if_still(&places);
         self.blind["residual_if_still"] = json!(growth);
         growth
@@ -504,7 +509,7 @@ impl Run<'_> {
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
-        let places: Vec<usize> = (0..used.len()).filter(|&k| asked.contains(&used[k])).collect();
+        let places = places(asked, used);
         let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
@@ -573,7 +578,7 @@ impl Run<'_> {
         let channels = self.most_telling(used, used);
         let frames = self.luminance_frames(used, channels);
         let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
-        let places: Vec<usize> = (0..used.len()).filter(|&k| still.contains(&used[k])).collect();
+        let places = places(still, used);
         let events = &mut self.events;
         let found = blind::freed(&frames, &latent.mean_of(channels), &known, &places, centre, &mut |s| {
             let stage = "looking whether frames that seem sharp moved a little".into();
@@ -584,7 +589,7 @@ impl Run<'_> {
         let moved = places.iter().any(|&k| found.extents[k] > SHAKEN);
         let likely = moved && found.left < line.left && found.unlike > line.unlike;
         let growth = likely.then(|| found.if_still());
-        let believed = growth.is_some_and(|growth| growth > line.growth);
+        let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
             // No look was taken before: one frame at least has surely steep edges.
             self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true });
