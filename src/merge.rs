@@ -2,8 +2,8 @@
 
 use crate::exposure::Bracket;
 use crate::image::{Plane, Rgb};
-use crate::kernels::NOISE_STEPS;
 use crate::mask;
+use crate::noise;
 use crate::pose::{nearest_pixel, project};
 use glam::{DMat3, DVec2};
 
@@ -23,7 +23,7 @@ pub fn irradiance(bracket: &Bracket, exposures: &[Rgb], masks: &[Plane], curves:
             let (mut num, mut den) = (0.0f64, 0.0f64);
             for (s, &i) in smooth.iter().zip(ids) {
                 let dt = frames[i].exposure_time as f32;
-                let noise = noise_at(&curves[i][c], s.data[p]);
+                let noise = noise::at(&curves[i][c], s.data[p]);
                 let m = masks[i].data[p];
                 let weight = f64::from(m * m * dt * dt / (noise * noise));
                 num += weight * f64::from(exposures[i].0[c].data[p] / dt);
@@ -88,17 +88,12 @@ pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>
     let (w, h) = mask.size();
     let one = |c: usize, p: usize| {
         let expected = irradiance.0[c].data[p] * exposure_time as f32;
-        ((exposure.0[c].data[p] - expected) / noise_at(&curves[c], expected)).powi(2)
+        ((exposure.0[c].data[p] - expected) / noise::at(&curves[c], expected)).powi(2)
     };
     Plane::from_fn(w, h, |x, y| {
         let p = y * w + x;
         if mask.data[p] > 0.0 { (one(0, p) + one(1, p) + one(2, p)) / 3.0 } else { f32::NAN }
     })
-}
-
-/// Noise of the exposure `x` from its curve: the sample below.
-fn noise_at(curve: &[f32], x: f32) -> f32 {
-    curve[((x.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1)]
 }
 
 /// Mean over squares of side 2 r + 1, edge pixels repeated.

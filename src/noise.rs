@@ -45,6 +45,21 @@ impl NoiseModel {
     }
 }
 
+/// [`NoiseModel::curve`] of each frame's channels.
+pub fn curves(frames: &[Frame], response: &Response, model: &NoiseModel) -> Vec<[Vec<f32>; 3]> {
+    frames.iter().map(|f| std::array::from_fn(|c| model.curve(response, c, f.levels))).collect()
+}
+
+/// What a [`NoiseModel::curve`] says at the exposure `x`: the sample below.
+pub fn at(curve: &[f32], x: f32) -> f32 {
+    curve[((x.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1)]
+}
+
+/// Curve of the variance of the mean of a frame's channels, where all three have the same exposure.
+pub fn of_mean(curves: &[Vec<f32>; 3]) -> Vec<f32> {
+    (0..NOISE_STEPS).map(|i| curves.iter().map(|c| c[i] * c[i]).sum::<f32>() / 9.0).collect()
+}
+
 /// Variance of the exposure that rounding to `levels` steps of intensity adds, as a function of the exposure.
 fn quantisation(response: &Response, channel: usize, levels: u32) -> impl Fn(f64) -> f64 {
     let step = 1.0 / f64::from(levels);

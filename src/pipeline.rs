@@ -3,7 +3,7 @@
 use crate::channels;
 use crate::deblur::{self, Observation, Prior, Solution};
 use crate::error::{Error, Result};
-use crate::exposure::{Bracket, Frame};
+use crate::exposure::Bracket;
 use crate::gpu::Gpu;
 use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::{Kernels, UNSEEN};
@@ -272,9 +272,9 @@ pub fn merge_with(
         let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
         (exposures, noise)
     });
-    let curves = curves(frames, response, &noise);
+    let curves = noise::curves(frames, response, &noise);
     let motions = vec![DMat3::IDENTITY; frames.len()];
-    let verdicts = triage::triage(frames, &exposures, &noise, &excluded, settings.sharp.as_deref(), &motions);
+    let verdicts = triage::triage(frames, &exposures, &curves, &excluded, settings.sharp.as_deref(), &motions);
     let mut run = Run {
         gpu,
         kernels,
@@ -301,11 +301,6 @@ pub fn merge_with(
     };
     run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
     run.reconstruct(verdicts, excluded, given)
-}
-
-/// Standard deviation of each frame's channels, see [`NoiseModel::curve`].
-fn curves(frames: &[Frame], response: &Response, noise: &NoiseModel) -> Vec<[Vec<f32>; 3]> {
-    frames.iter().map(|f| std::array::from_fn(|c| noise.curve(response, c, f.levels))).collect()
 }
 
 fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
@@ -434,7 +429,7 @@ impl Run<'_> {
         let moved = self.motions.iter().any(|m| *m != DMat3::IDENTITY);
         if moved || !self.left_out.is_empty() {
             let given = self.settings.sharp.as_deref();
-            verdicts = triage::triage(frames, &self.exposures, &self.noise, excluded, given, &self.motions);
+            verdicts = triage::triage(frames, &self.exposures, &self.curves, excluded, given, &self.motions);
         }
         Ok(verdicts)
     }
@@ -442,8 +437,8 @@ impl Run<'_> {
     fn register_on(&mut self, reference: usize, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
         let frames = self.bracket.frames();
         let mut found = vec![Registration::skipped(); frames.len()];
-        let (exposures, noise) = (std::mem::take(&mut self.exposures), self.noise);
-        let mut registrar = Registrar::new(frames, &exposures, &noise, reference);
+        let (exposures, curves) = (std::mem::take(&mut self.exposures), std::mem::take(&mut self.curves));
+        let mut registrar = Registrar::new(frames, &exposures, &curves, reference);
         found[reference] = registrar.of_reference();
         let mut going = Ok(());
         for i in registrar.order(used, sharp).into_iter().filter(|&i| !known[i]) {
@@ -453,7 +448,7 @@ impl Run<'_> {
             }
             found[i] = registrar.register(i, sharp[i]);
         }
-        self.exposures = exposures;
+        (self.exposures, self.curves) = (exposures, curves);
         going.map(|()| found)
     }
 
@@ -474,7 +469,7 @@ impl Run<'_> {
             },
         )?;
         if let Some(noise) = noise {
-            self.curves = curves(frames, self.response, &noise);
+            self.curves = noise::curves(frames, self.response, &noise);
             self.noise = noise;
         }
         Ok(())

@@ -3,7 +3,7 @@
 use crate::exposure::Frame;
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
-use crate::noise::NoiseModel;
+use crate::noise;
 use crate::pose::nearest_pixel;
 use glam::DMat3;
 use rayon::prelude::*;
@@ -45,8 +45,8 @@ const DETAIL: f64 = 0.68;
 const STEEPNESS: f64 = 0.335;
 /// Relative error of the noise level that is taken off the energies.
 const NOISE_ERROR: f64 = 0.2;
-/// Most that the noise model may be off by.
-const MOST_EXCESS: f64 = 2.0;
+/// Most that the noise model may be off by: it takes the channels' noise for independent, and JPEG files rather have the same in all three.
+const MOST_EXCESS: f64 = 3.0;
 /// Side in pixels of the squares of which the flattest tell the noise, as large a part of them as [`FLAT`].
 const SMALL: usize = 8;
 /// See [`SMALL`].
@@ -129,17 +129,18 @@ struct Luminance {
     noise_error: f64,
 }
 
-fn luminance(frame: &Frame, x: &Rgb, noise: &NoiseModel) -> Luminance {
+fn luminance(frame: &Frame, x: &Rgb, curves: &[Vec<f32>; 3]) -> Luminance {
     let clipped = mask::clipped(frame, Channels::ALL);
     let dt = frame.exposure_time;
     let mean = x.mean();
     let counts = Plane { data: clipped.iter().map(|c| if *c { 0.0 } else { 1.0 }).collect(), ..mean.clone() };
     // What the pixels around say is free of the pixel's own noise, by which it must not be chosen or weighted.
     let around = mean.zip(&counts, |v, k| v * k).box_sum(LOCAL).zip(&counts.box_sum(LOCAL), |s, n| if n > 0.5 { s / n } else { 0.0 });
-    // Below three standard deviations, noise clipped at black is no longer symmetric.
-    let floor = 3.0 * noise.read.sqrt();
-    let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && f64::from(v) > floor).collect();
-    let variance = around.map(|v| (noise.variance(f64::from(v)) / 3.0 / (dt * dt)) as f32);
+    let noise = noise::of_mean(curves);
+    // Below three standard deviations of a channel, noise clipped at black is no longer symmetric.
+    let floor = 3.0 * (3.0 * noise[0]).sqrt();
+    let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && v > floor).collect();
+    let variance = around.map(|v| noise::at(&noise, v) / (dt * dt) as f32);
     Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR }
 }
 
@@ -246,6 +247,8 @@ struct Energy {
     sum: f64,
     /// Two standard deviations, and the noise level's own error.
     error: f64,
+    /// What of `sum` may be noise as well, where the frame itself shows more of it than the error of the noise level explains.
+    doubtful: f64,
     /// Parts of `sum` by squares of [`BLOCK`] pixels.
     blocks: Vec<f64>,
 }
@@ -265,16 +268,17 @@ fn energy(a: &Luminance, b: &Luminance, shared: &[bool], direction: (usize, usiz
         // Variance of a squared difference of noise sigma^2: 2 sigma^4 + 4 d^2 sigma^2.
         scatter += weight * weight * (2.0 * own * own + 4.0 * (d * d - own).max(0.0) * own);
     });
-    Energy { sum: blocks.iter().sum(), error: 2.0 * scatter.sqrt() + a.noise_error * noise, blocks }
+    let doubtful = (a.noise_error - 2.0 * NOISE_ERROR).max(0.0) * noise;
+    Energy { sum: blocks.iter().sum(), error: 2.0 * scatter.sqrt() + a.noise_error * noise, doubtful, blocks }
 }
 
-/// Fine structure of a frame as a part of another's, at most that: with the errors of both, and two standard errors of what the squares of the
-/// frame say, each by itself, since what a few of them say may be a trail's. `None` where the other's does not stand clear of noise.
+/// Fine structure of a frame as a part of another's, at most that: with the error of its own and without what is doubtful of the other's, and
+/// two standard errors of what the squares of the frame say, each by itself, since what a few of them say may be a trail's. `None` where the other's does not stand clear of noise.
 fn share(own: &Energy, other: &Energy) -> Option<f64> {
     if other.sum <= 3.0 * other.error || other.sum <= 3.0 * own.error {
         return None;
     }
-    let share = (own.sum + own.error).max(0.0) / other.sum;
+    let share = (own.sum + own.error).max(0.0) / (other.sum - other.doubtful);
     let scatter: f64 = own.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - share * b).powi(2)).sum();
     Some(share + 2.0 * scatter.sqrt() / other.sum)
 }
@@ -320,13 +324,13 @@ fn steepness(a: &Luminance) -> (f64, f64) {
 pub fn triage(
     frames: &[Frame],
     exposures: &[Rgb],
-    noise: &NoiseModel,
+    curves: &[[Vec<f32>; 3]],
     excluded: &[bool],
     given: Option<&[usize]>,
     motions: &[DMat3],
 ) -> Vec<Verdict> {
     let looked = Looked::at(frames[0].intensity.size(), ENOUGH);
-    let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).map(|(f, x)| luminance(f, x, noise)).collect();
+    let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).zip(curves).map(|((f, x), c)| luminance(f, x, c)).collect();
     let verdict = |a: &Luminance| {
         let (steepness, evenness) = steepness(&a.part(&looked));
         Verdict { sharp: false, detail: 1.0, compared: false, steepness, evenness, reason: String::new() }

@@ -74,7 +74,9 @@ pub struct Freed {
     pub scale: usize,
     /// Extent of each frame's blur in pixels.
     pub extents: Vec<f64>,
-    /// Held-out residuals (geometric mean over the frames) over those with the frames held still.
+    /// Squared held-out residuals over noise variance, geometric mean over the frames.
+    pub held_out: f64,
+    /// The same over that with the frames held still.
     pub left: f64,
     /// By how much the blurs of the frames set free differ from each other (most of two), that of one alone from a round one: the norm (Frobenius) of
     /// the difference of the covariances of their translations over the sum of both traces, 0 for blurs alike. A lens, and what a scene
@@ -128,8 +130,10 @@ const DRAWN: (usize, f32) = (15, 1.5);
 /// round still lacks, and are lost on it: with eight the estimate takes twice as long and ends no better.
 const REFINED: (usize, usize) = (4, 8);
 /// Rounds after which frames that were held still have moved as far as they will, and those after which it is seen whether they move at all:
-/// whether the residuals fall below this part of what they were.
+/// whether the residuals fall below this part of what they were, or their blurs become unlike.
 const FREED: (usize, usize, f64) = (6, 3, 0.97);
+/// [`Freed::unlike`] up to which blurs are alike by then.
+const ALIKE: f64 = 0.1;
 /// Rounds of luminance and TSFs under the assumption that frames did not move.
 const STILLED: usize = 4;
 /// Seed of the draws.
@@ -612,7 +616,7 @@ fn unlike(spreads: &[Matrix2<f64>]) -> f64 {
 /// What the blurs of all `frames` become where those taken for sharp, `still`, may have moved as well: from the scene as these show it, `latent`, and
 /// the TSFs that follow from it, `tsfs`, of which the frame `reference` lies about the identity. TSFs are fitted to drawn scenes: the best one
 /// has the blur that those frames share, and under it they stand still. From nearby that finds a blur of a pixel or two, which the coarse
-/// levels of [`estimate`] cannot tell. Where residuals hardly fall the rounds end early. `None` where `progress` returns `false`.
+/// levels of [`estimate`] cannot tell. Where residuals hardly fall and blurs stay alike the rounds end early. `None` where `progress` returns `false`.
 pub fn freed(
     frames: &[Frame],
     latent: &Plane,
@@ -629,19 +633,23 @@ pub fn freed(
     let settled = |state: &State| {
         let mut state = state.clone();
         level.settle(&mut state);
-        let left = residual(&state) / at_rest;
+        let left = residual(&state);
         (state, left)
+    };
+    let apart = |tsfs: &[Tsf]| {
+        let spreads: Vec<Matrix2<f64>> = still.iter().map(|&k| Matrix2::from_column_slice(&tsfs[k].covariance().to_cols_array())).collect();
+        unlike(&spreads)
     };
     let (rounds, first, hardly) = FREED;
     let mut random = Random::new(SEED, 2);
-    let (state, left) = 'moved: {
+    let (state, held_out) = 'moved: {
         for k in 0..rounds {
             if !progress(Stage { scale, fraction: (k + 1) as f32 / (rounds + 1) as f32 }) {
                 return None;
             }
             if k == first {
                 let found = settled(&state);
-                if found.1 > hardly {
+                if found.1 > hardly * at_rest && apart(&found.0.tsfs) < ALIKE {
                     break 'moved found;
                 }
             }
@@ -651,7 +659,16 @@ pub fn freed(
         settled(&state)
     };
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
-    let spreads: Vec<Matrix2<f64>> = still.iter().map(|&k| Matrix2::from_column_slice(&tsfs[k].covariance().to_cols_array())).collect();
-    let (extents, unlike) = (level.extents(&state), unlike(&spreads));
-    Some(Freed { tsfs, luminance, scale, extents, left, unlike, seen: Look { level, state }, free: still.to_vec() })
+    let (extents, unlike) = (level.extents(&state), apart(&tsfs));
+    Some(Freed {
+        tsfs,
+        luminance,
+        scale,
+        extents,
+        held_out,
+        left: held_out / at_rest,
+        unlike,
+        seen: Look { level, state },
+        free: still.to_vec(),
+    })
 }

@@ -21,11 +21,12 @@ const SCENE: Drawn = Drawn::Chart;
 fn matches(bracket: &Bracket, sharp: &[bool]) -> Vec<(usize, usize, usize, usize)> {
     let exposures: Vec<Rgb> = bracket.frames().iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
     let level = noise::estimate(bracket.frames(), &exposures, &Response::Srgb);
+    let curves = noise::curves(bracket.frames(), &Response::Srgb, &level);
     let n = bracket.frames().len();
     let pairs = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
     pairs
         .map(|(i, j)| {
-            let (matches, inliers) = Registrar::new(bracket.frames(), &exposures, &level, i).matches(j, sharp[j]);
+            let (matches, inliers) = Registrar::new(bracket.frames(), &exposures, &curves, i).matches(j, sharp[j]);
             (i, j, matches, inliers)
         })
         .collect()

@@ -153,6 +153,8 @@ const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25 };
 /// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
 const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12 };
+/// [`blind::Freed::held_out`] at most, several times what aliasing leaves on clean frames (9): what the frames do not agree about beyond is no motion.
+const AGREED: f64 = 30.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
@@ -540,9 +542,18 @@ impl Run<'_> {
             "held_out_chi_squared_of_merge": found.held_out_merge,
             "ways": found.ways,
         });
-        if !believed && doubtful {
-            let still = if stood_still { asked.to_vec() } else { without(used, &moved) };
-            return Ok((None, if explained || stood_still { still } else { Vec::new() }));
+        if !believed && let Some(doubt) = doubt {
+            let still = if stood_still {
+                asked.to_vec()
+            } else if explained {
+                without(used, &moved)
+            } else if joint > alone && doubt.passing.len() == used.len() {
+                // Whatever the frames do not agree about, motion makes it worse: a response that is not quite theirs, flare, what moved by itself.
+                used.to_vec()
+            } else {
+                Vec::new()
+            };
+            return Ok((None, still));
         }
         if !believed {
             self.degrade(format!(
@@ -587,7 +598,7 @@ impl Run<'_> {
         .ok_or(Error::Cancelled)?;
         let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
         let moved = places.iter().any(|&k| found.extents[k] > SHAKEN);
-        let likely = moved && found.left < line.left && found.unlike > line.unlike;
+        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < AGREED;
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
@@ -596,6 +607,7 @@ impl Run<'_> {
         }
         self.blind["set_free"] = json!({
             "believed": believed,
+            "held_out_chi_squared": found.held_out,
             "residual_left": found.left,
             "unlike": found.unlike,
             "residual_if_still": growth,

@@ -26,7 +26,6 @@ pub use motion::{Model, distance};
 
 use crate::exposure::Frame;
 use crate::image::Rgb;
-use crate::noise::NoiseModel;
 use glam::{DMat3, DVec2};
 use picture::{Picture, Tone};
 use serde::Serialize;
@@ -126,16 +125,16 @@ const LARGEST_RESIDUE: f64 = 0.004;
 pub struct Registrar<'a> {
     frames: &'a [Frame],
     exposures: &'a [Rgb],
-    noise: &'a NoiseModel,
+    curves: &'a [[Vec<f32>; 3]],
     /// Merge of the sharp frames so far on the reference's grid, fine to coarse.
     merged: Vec<Picture>,
     reference: usize,
 }
 
 impl<'a> Registrar<'a> {
-    /// Starts from frame `reference`. `exposures`: f⁻¹(Z) of each frame.
-    pub fn new(frames: &'a [Frame], exposures: &'a [Rgb], noise: &'a NoiseModel, reference: usize) -> Self {
-        let mut registrar = Self { frames, exposures, noise, merged: Vec::new(), reference };
+    /// Starts from frame `reference`. `exposures`: f⁻¹(Z) of each frame; `curves`: its noise, see [`crate::noise::NoiseModel::curve`].
+    pub fn new(frames: &'a [Frame], exposures: &'a [Rgb], curves: &'a [[Vec<f32>; 3]], reference: usize) -> Self {
+        let mut registrar = Self { frames, exposures, curves, merged: Vec::new(), reference };
         registrar.merged = pyramid(registrar.picture(reference));
         registrar
     }
@@ -154,7 +153,7 @@ impl<'a> Registrar<'a> {
     }
 
     fn picture(&self, i: usize) -> Picture {
-        let mut picture = Picture::of(&self.frames[i], &self.exposures[i], self.noise);
+        let mut picture = Picture::of(&self.frames[i], &self.exposures[i], &self.curves[i]);
         while picture.size().0 * picture.size().1 > MOST_PIXELS {
             picture = picture.halved();
         }

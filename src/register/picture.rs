@@ -3,7 +3,7 @@
 use crate::exposure::Frame;
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
-use crate::noise::NoiseModel;
+use crate::noise;
 use crate::pose::project;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -24,15 +24,15 @@ pub(super) struct Picture {
 
 impl Picture {
     /// The whole frame.
-    pub(super) fn of(frame: &Frame, exposure: &Rgb, noise: &NoiseModel) -> Self {
+    pub(super) fn of(frame: &Frame, exposure: &Rgb, curves: &[Vec<f32>; 3]) -> Self {
         let dt = frame.exposure_time;
         let mean = exposure.mean();
         let clipped = mask::clipped(frame, Channels::ALL);
-        let step = 1.0 / f64::from(frame.levels);
-        // Three channels, and rounding: in the shadows of 8-bit files it is larger than the noise itself.
-        let variance = |x: f64| (noise.variance(x) / 3.0 + (step * x.max(0.0).powf(0.55)).powi(2) / 36.0 + 1e-12) / (dt * dt);
+        // Rounding included: in the shadows of 8-bit files it is larger than the noise itself.
+        let noise = noise::of_mean(curves);
+        let variance = |x: f32| f64::from(noise::at(&noise, x)) / (dt * dt);
         Self {
-            variance: mean.map(|v| variance(f64::from(v)) as f32),
+            variance: mean.map(|v| variance(v) as f32),
             valid: Plane { data: clipped.iter().map(|&c| if c { 0.0 } else { 1.0 }).collect(), ..mean },
             black: variance(0.0),
             irradiance: mean.map(|v| (f64::from(v) / dt) as f32),

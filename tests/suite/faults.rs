@@ -1,14 +1,16 @@
 //! What must not spoil a merge: a wrong TSF, another scene, something that moved, noise of any level, light beyond white, a soft lens.
 
+use crate::support::files::shared;
 use std::sync::OnceLock;
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
+use unshaken::io::{ldr, metadata};
 use unshaken::mask;
 use unshaken::metrics::{self, Judge};
 use unshaken::noise::NoiseModel;
 use unshaken::pipeline::{self, Outcome, Settings};
 use unshaken::pose::Pose;
-use unshaken::response::Response;
+use unshaken::response::{self, Response};
 use unshaken::synth::{self, Camera, SyntheticBracket, Tremor};
 use unshaken::tsf::{TsfEntry, TsfFile};
 
@@ -253,4 +255,28 @@ fn a_soft_lens_is_no_motion() {
     assert!(blind["set_free"]["residual_left"].as_f64().unwrap() < 0.9, "there is something to be told: {blind}");
     assert_eq!(blind["set_free"]["believed"], false, "{blind}");
     assert!((free - held).abs() < 0.3, "{free:.2} dB, {held:.2} taken for sharp");
+}
+
+/// A real bracket of a night, none of its frames shaken, at a sixth of its size. Its frames disagree by tens of times their noise (flare, a fountain, what
+/// the camera made of the shadows), which motion explains a little, as it would anything.
+#[test]
+fn what_sharp_frames_do_not_agree_about_is_no_motion() {
+    let Some(folder) = shared("data/brackets/arch") else { return };
+    let read = |i: usize| {
+        let path = folder.join(format!("img0{i}.jpg"));
+        let picture = ldr::read(&path).unwrap();
+        let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
+        Frame { name: format!("img0{i}.jpg"), intensity: picture.intensity, levels: picture.levels, exposure_time }
+    };
+    let whole = Bracket::new((0..4).map(read).collect()).unwrap();
+    let response = response::automatic(&whole).unwrap().response;
+    let small = response::reduced(&whole, &response, 6).unwrap();
+    let found = pipeline::merge(&small, &response, &Settings::default(), None, &mut |_| true).unwrap();
+    let blind = &found.report["blind"];
+    println!("{blind}");
+    assert!(blind["set_free"]["held_out_chi_squared"].as_f64().unwrap() > 100.0, "they disagree: {blind}");
+    assert_eq!(found.degraded, Vec::<String>::new());
+    for frame in found.report["frames"].as_array().unwrap() {
+        assert_eq!((&frame["used"], &frame["sharp"]), (&true.into(), &true.into()), "{}: {}", frame["frame"], frame["triage"]);
+    }
 }
