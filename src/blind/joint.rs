@@ -434,7 +434,7 @@ fn coarsest(frames: &[Frame]) -> usize {
 fn finest(frames: &[Frame]) -> usize {
     let (w, h) = frames[0].blurred.size();
     let mut scale = 1;
-    while w * h / (scale * scale) > LARGEST && scale < coarsest(frames) {
+    while !fits((w / scale, h / scale)) && scale < coarsest(frames) {
         scale *= 2;
     }
     scale
@@ -599,6 +599,11 @@ pub fn estimate(
     let held_out_merge = level.judge(&still);
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
     Some(Joint { luminance, tsfs, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
+}
+
+/// Whether frames of this size are worked on as they are, not at a smaller one.
+pub fn fits(size: (usize, usize)) -> bool {
+    size.0 * size.1 <= LARGEST
 }
 
 /// See [`Freed::unlike`], of blurs with the covariances `spreads`.

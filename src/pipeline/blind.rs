@@ -6,11 +6,11 @@ use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::merge;
-use crate::pose::project;
+use crate::pose::{Pose, project};
 use crate::psf::{self, Patch, Psf};
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
-use glam::DVec2;
+use glam::{DMat3, DVec2};
 use serde_json::{Value, json};
 
 /// What is done when no frame is sharp.
@@ -54,6 +54,47 @@ impl Seen {
 
     fn all_moved(&self) -> bool {
         self.beyond(&self.frames, SHAKEN).len() == self.frames.len()
+    }
+}
+
+/// A part of some frames that lies on the same part of the scene in all of them, to the pixel.
+struct Window {
+    /// Its upper left corner in the reference frame, pixels.
+    at: (usize, usize),
+    /// Its width and height in pixels.
+    size: (usize, usize),
+    /// Its centre in the reference frame, centred pixels.
+    centre: DVec2,
+    /// How far it lies from there in each of the frames, whole pixels.
+    shifts: Vec<DVec2>,
+}
+
+impl Window {
+    /// Its upper left corner in the frame `k` of them.
+    fn place(&self, k: usize) -> (usize, usize) {
+        ((self.at.0 as f64 + self.shifts[k].x) as usize, (self.at.1 as f64 + self.shifts[k].y) as usize)
+    }
+
+    /// The `frames` within it.
+    fn cut(&self, frames: &[Frame]) -> Vec<Frame> {
+        frames.iter().enumerate().map(|(k, f)| f.crop(self.place(k), self.size)).collect()
+    }
+
+    /// `tsf` of the frame `k` as the window sees it: exact where it has no rotations out of the image plane, else true at its centre.
+    fn seen(&self, k: usize, tsf: &Tsf) -> Tsf {
+        let here = self.centre + self.shifts[k];
+        tsf.around(here).about(DMat3::from_translation(-here) * tsf.base * DMat3::from_translation(self.centre))
+    }
+
+    /// The way back: `tsf` that was found in the window of the frame `k`, on the frame.
+    fn on_frame(&self, k: usize, tsf: &Tsf) -> Tsf {
+        let here = self.centre + self.shifts[k];
+        tsf.around(-here).about(DMat3::from_translation(here) * tsf.base * DMat3::from_translation(-self.centre))
+    }
+
+    /// Left, top, width and height in the reference frame.
+    fn report(&self) -> [usize; 4] {
+        [self.at.0, self.at.1, self.size.0, self.size.1]
     }
 }
 
@@ -158,6 +199,8 @@ const AGREED: f64 = 30.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
+/// Longer and shorter side at most, in pixels, of the part of large frames in which frames that pass for sharp are set free.
+const FREE_WINDOW: (usize, usize) = (540, 360);
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
 const WINDOW: (usize, usize) = (360, 240);
@@ -388,33 +431,29 @@ impl Run<'_> {
         order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
-    /// A look at `frames`: the joint estimate of a part of the frame with much texture, at its coarsest level; `None` where there is none to be had.
-    fn look(&mut self, frames: &[usize], from: f32, to: f32) -> Result<Option<Seen>> {
-        if frames.len() < 2 {
-            return Ok(None);
-        }
+    /// The part with much texture of `frames`, whose luminances are `whole`, of `most` (longer and shorter side) pixels at most; `None` where there is none to be
+    /// had, or the frames are turned against each other.
+    fn window(&self, frames: &[usize], whole: &[Frame], most: (usize, usize)) -> Option<Window> {
         let (w, h) = self.bracket.size();
         // Where each frame's window lies, from the reference's: to the pixel.
         let shift = |i: usize, c: DVec2| (project(&self.motions[i], c) - c).round();
         let corner = DVec2::new(0.5 * w as f64, 0.5 * h as f64);
         let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(x, y)| DVec2::new(x, y) * corner);
-        let most = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
+        let margin = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
         let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
-        let (rw, rh) = (room(w, most.x), room(h, most.y));
-        let longest = |n: usize, other: usize| n.min(if n >= other { WINDOW.0 } else { WINDOW.1 });
+        let (rw, rh) = (room(w, margin.x), room(h, margin.y));
+        let longest = |n: usize, other: usize| n.min(if n >= other { most.0 } else { most.1 });
         let (ww, wh) = (longest(rw, rh), longest(rh, rw));
         if ww.min(wh) < LEAST_WINDOW {
-            return Ok(None);
+            return None;
         }
-        let (mx, my) = (most.x as usize, most.y as usize);
-        let channels = self.most_telling(frames, frames);
-        let whole = self.luminance_frames(frames, channels);
+        let (mx, my) = (margin.x as usize, margin.y as usize);
         let first = &whole[0];
         let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
         let seen = |p: &Plane| p.crop(mx, my, rw, rh);
-        let Some(best) = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied() else { return Ok(None) };
+        let best = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied()?;
         let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
-        let centre = DVec2::new((x + ww / 2) as f64, (y + wh / 2) as f64) - corner;
+        let centre = DVec2::new(x as f64 + 0.5 * (ww as f64 - w as f64), y as f64 + 0.5 * (wh as f64 - h as f64));
         let turned = |i: usize| {
             let s = shift(i, centre);
             [(-1.0, -1.0), (1.0, 1.0)].iter().any(|&(a, b)| {
@@ -423,18 +462,26 @@ impl Run<'_> {
             })
         };
         if frames.iter().any(|&i| turned(i)) {
+            return None;
+        }
+        Some(Window { at: (x, y), size: (ww, wh), centre, shifts: frames.iter().map(|&i| shift(i, centre)).collect() })
+    }
+
+    /// A look at `frames`: the joint estimate of a part of the frame with much texture, at its coarsest level; `None` where there is none to be had.
+    fn look(&mut self, frames: &[usize], from: f32, to: f32) -> Result<Option<Seen>> {
+        if frames.len() < 2 {
             return Ok(None);
         }
-        let at = |i: usize| {
-            let s = shift(i, centre);
-            ((x as f64 + s.x) as usize, (y as f64 + s.y) as usize)
-        };
-        let cut: Vec<Frame> = frames.iter().zip(&whole).map(|(&i, f)| f.crop(at(i), (ww, wh))).collect();
+        let channels = self.most_telling(frames, frames);
+        let whole = self.luminance_frames(frames, channels);
+        let Some(window) = self.window(frames, &whole, WINDOW) else { return Ok(None) };
+        let (ww, wh) = window.size;
+        let cut = window.cut(&whole);
         let starts: Vec<Start> = self
             .starts(frames, channels)
             .into_iter()
             .map(|s| {
-                let (x, y) = at(frames[s.reference]);
+                let (x, y) = window.place(s.reference);
                 Start { luminance: s.luminance.crop(x, y, ww, wh), ..s }
             })
             .collect();
@@ -446,9 +493,9 @@ impl Run<'_> {
         .ok_or(Error::Cancelled)?;
         let names: Vec<&str> = frames.iter().map(|&i| self.bracket.frames()[i].name.as_str()).collect();
         self.blind = json!({
-            "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": [x, y, ww, wh], "extent_px": look.extents(),
+            "method": "joint", "believed": false, "in_doubt": true, "looked_at": names, "window_px": window.report(), "extent_px": look.extents(),
         });
-        Ok(Some(Seen { frames: frames.to_vec(), look, whole: (ww, wh) == (w, h) }))
+        Ok(Some(Seen { frames: frames.to_vec(), look, whole: (ww, wh) == self.bracket.size() }))
     }
 
     /// The paper's path (section III-B) over the frames `used`; `None` where patches lack texture.
@@ -587,11 +634,19 @@ impl Run<'_> {
     ) -> Result<Option<Found>> {
         let Some(centre) = used.iter().position(|&i| i == reference) else { return Ok(None) };
         let channels = self.most_telling(used, used);
-        let frames = self.luminance_frames(used, channels);
-        let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
+        let mut frames = self.luminance_frames(used, channels);
+        let mut luminance = latent.mean_of(channels);
+        let whole: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
+        let mut known = whole.clone();
         let places = places(still, used);
+        // At half the size as little does not show.
+        let window = if blind::fits(luminance.size()) { None } else { self.window(used, &frames, FREE_WINDOW) };
+        if let Some(window) = &window {
+            (frames, luminance) = (window.cut(&frames), luminance.crop(window.at.0, window.at.1, window.size.0, window.size.1));
+            known = known.iter().enumerate().map(|(k, t)| window.seen(k, t)).collect();
+        }
         let events = &mut self.events;
-        let found = blind::freed(&frames, &latent.mean_of(channels), &known, &places, centre, &mut |s| {
+        let found = blind::freed(&frames, &luminance, &known, &places, centre, &mut |s| {
             let stage = "looking whether frames that seem sharp moved a little".into();
             events(Event::Progress { stage, fraction: 0.38 + 0.02 * s.fraction })
         })
@@ -612,11 +667,26 @@ impl Run<'_> {
             "unlike": found.unlike,
             "residual_if_still": growth,
             "extent_px": found.extents,
+            "window_px": window.as_ref().map(Window::report),
         });
         if !believed {
             return Ok(None);
         }
         self.blind["believed"] = json!(true);
+        if let Some(window) = window {
+            // What the window tells of those set free is refined on the frame, with the others. A roll far from the frame's centre is a shift there, and
+            // hardly told from one.
+            let level = |tsf: &Tsf| {
+                let theta_z_deg = tsf.mean().theta_z_deg;
+                Tsf { poses: tsf.poses.iter().map(|p| Pose { theta_z_deg, ..*p }).collect(), ..tsf.clone() }
+            };
+            let lifted = |k: usize| if places.contains(&k) { window.on_frame(k, &level(&found.tsfs[k])) } else { whole[k].clone() };
+            let tsfs: Vec<Tsf> = (0..used.len()).map(lifted).collect();
+            for (&i, tsf) in used.iter().zip(&tsfs) {
+                self.motions[i] = tsf.centre();
+            }
+            return Ok(Some(Found { start: latent.clone(), tsfs, reference, reduced: true }));
+        }
         let start = self.scene(used, &found.tsfs, &found.luminance, channels);
         Ok(Some(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 }))
     }
@@ -669,6 +739,38 @@ mod tests {
         assert!(!less_detailed(&all, &[0, 3]), "the other one does not pass for sharp");
         assert!(!less_detailed(&all, &[0]), "the other one is not in use");
         assert!(!less_detailed(&all, &[0, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn a_window_sees_what_the_frame_sees() {
+        let window =
+            Window { at: (700, 90), size: (320, 240), centre: DVec2::new(360.5, -89.5), shifts: vec![DVec2::ZERO, DVec2::new(-7.0, 3.0)] };
+        let base =
+            DMat3::from_translation(DVec2::new(-6.8, 3.3)) * DMat3::from_angle(0.01) * DMat3::from_translation(DVec2::new(0.2, -0.1));
+        let poses = vec![Pose::planar(1.5, -0.5, 0.3, 0.6), Pose::planar(-2.0, 1.0, -0.2, 0.4)];
+        let tsf = Tsf::new(900.0, poses).unwrap().about(base);
+        let seen = window.seen(1, &tsf);
+        let corner = window.centre + window.shifts[1];
+        for p in [DVec2::ZERO, DVec2::new(-150.0, 100.0), DVec2::new(120.5, -80.25)] {
+            for (here, there) in seen.poses.iter().zip(&tsf.poses) {
+                let found = here.apply(seen.focal_px, project(&seen.base, p));
+                let want = there.apply(tsf.focal_px, project(&tsf.base, p + window.centre)) - corner;
+                assert!((found - want).length() < 1e-9, "{p}: {found} for {want}");
+            }
+        }
+        let back = window.on_frame(1, &seen);
+        for (found, want) in back.poses.iter().zip(&tsf.poses) {
+            assert!(
+                (found.t_x - want.t_x).abs() + (found.t_y - want.t_y).abs() < 1e-9 && found.theta_z_deg == want.theta_z_deg,
+                "{found:?}"
+            );
+        }
+        assert!(back.base.abs_diff_eq(tsf.base, 1e-9), "{}", back.base);
+        // Out of the image plane: true at the window's centre.
+        let turned = Tsf::new(900.0, vec![Pose { theta_x_deg: 0.4, theta_y_deg: -0.3, ..Pose::planar(1.0, 2.0, 0.1, 1.0) }]).unwrap();
+        let (found, pose) = (window.seen(0, &turned), turned.poses[0]);
+        let centre = pose.apply(900.0, window.centre) - window.centre;
+        assert!((found.poses[0].apply(900.0, DVec2::ZERO) - centre).length() < 1e-9, "{found:?}");
     }
 
     #[test]

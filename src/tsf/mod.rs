@@ -127,6 +127,17 @@ impl Tsf {
         Self { focal_px: factor * self.focal_px, poses, base: larger * self.base * larger.inverse() }
     }
 
+    /// The same poses about the point `centre` (centred pixels) instead of the frame's own centre, where they turn in the image plane only; of other
+    /// rotations what they do at that point. The base stays.
+    #[must_use]
+    pub fn around(&self, centre: DVec2) -> Self {
+        let moved = |p: &Pose| {
+            let t = p.apply(self.focal_px, centre) - centre;
+            Pose::planar(t.x, t.y, p.theta_z_deg, p.weight)
+        };
+        Self { poses: self.poses.iter().map(moved).collect(), ..self.clone() }
+    }
+
     /// Weighted mean pose: (t_x, t_y) in pixels, (θ_x, θ_y, θ_z) in degrees.
     pub fn mean(&self) -> Pose {
         let mut m = Pose { weight: 1.0, ..Pose::planar(0.0, 0.0, 0.0, 1.0) };
