@@ -194,8 +194,9 @@ const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25 };
 /// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
 const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12 };
-/// [`blind::Freed::held_out`] at most, several times what aliasing leaves on clean frames (9): what the frames do not agree about beyond is no motion.
-const AGREED: f64 = 30.0;
+/// [`blind::Freed::held_out`] at most: what the frames do not agree about beyond is no motion. Aliasing leaves up to 9 at a full well of 4000 electrons, and as
+/// much more as there is less noise.
+const AGREED: f64 = 300.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
@@ -431,15 +432,18 @@ impl Run<'_> {
         order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
+    /// How far the point `c` of the reference frame (centred pixels) lies from there in frame `i`: to the pixel.
+    fn shift(&self, i: usize, c: DVec2) -> DVec2 {
+        (project(&self.motions[i], c) - c).round()
+    }
+
     /// The part with much texture of `frames`, whose luminances are `whole`, of `most` (longer and shorter side) pixels at most; `None` where there is none to be
-    /// had, or the frames are turned against each other.
+    /// had.
     fn window(&self, frames: &[usize], whole: &[Frame], most: (usize, usize)) -> Option<Window> {
         let (w, h) = self.bracket.size();
-        // Where each frame's window lies, from the reference's: to the pixel.
-        let shift = |i: usize, c: DVec2| (project(&self.motions[i], c) - c).round();
         let corner = DVec2::new(0.5 * w as f64, 0.5 * h as f64);
         let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(x, y)| DVec2::new(x, y) * corner);
-        let margin = frames.iter().flat_map(|&i| corners.map(|c| shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
+        let margin = frames.iter().flat_map(|&i| corners.map(|c| self.shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
         let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
         let (rw, rh) = (room(w, margin.x), room(h, margin.y));
         let longest = |n: usize, other: usize| n.min(if n >= other { most.0 } else { most.1 });
@@ -454,17 +458,7 @@ impl Run<'_> {
         let best = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied()?;
         let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
         let centre = DVec2::new(x as f64 + 0.5 * (ww as f64 - w as f64), y as f64 + 0.5 * (wh as f64 - h as f64));
-        let turned = |i: usize| {
-            let s = shift(i, centre);
-            [(-1.0, -1.0), (1.0, 1.0)].iter().any(|&(a, b)| {
-                let c = centre + 0.5 * DVec2::new(a * ww as f64, b * wh as f64);
-                (shift(i, c) - s).abs().max_element() > DISPLACED
-            })
-        };
-        if frames.iter().any(|&i| turned(i)) {
-            return None;
-        }
-        Some(Window { at: (x, y), size: (ww, wh), centre, shifts: frames.iter().map(|&i| shift(i, centre)).collect() })
+        Some(Window { at: (x, y), size: (ww, wh), centre, shifts: frames.iter().map(|&i| self.shift(i, centre)).collect() })
     }
 
     /// A look at `frames`: the joint estimate of a part of the frame with much texture, at its coarsest level; `None` where there is none to be had.
@@ -476,6 +470,16 @@ impl Run<'_> {
         let whole = self.luminance_frames(frames, channels);
         let Some(window) = self.window(frames, &whole, WINDOW) else { return Ok(None) };
         let (ww, wh) = window.size;
+        // The look takes the frames for displaced by whole pixels alone.
+        let turned = |(k, i): (usize, &usize)| {
+            [(-1.0, -1.0), (1.0, 1.0)].iter().any(|&(a, b)| {
+                let c = window.centre + 0.5 * DVec2::new(a * ww as f64, b * wh as f64);
+                (self.shift(*i, c) - window.shifts[k]).abs().max_element() > DISPLACED
+            })
+        };
+        if frames.iter().enumerate().any(turned) {
+            return Ok(None);
+        }
         let cut = window.cut(&whole);
         let starts: Vec<Start> = self
             .starts(frames, channels)
