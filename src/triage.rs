@@ -21,6 +21,8 @@ pub struct Verdict {
     /// Whether fine structure of it or of another frame stood clear of the noise of both where they see the same light: else `detail` says
     /// nothing.
     pub compared: bool,
+    /// Whether that leads, by frames each of which clearly has as much as the one before, from the shortest of those with as much as any to this one.
+    pub linked: bool,
     /// Energy of one-pixel over that of two-pixel differences, worst direction: about 0.5 where edges are one pixel wide, 0.25 where
     /// they are ramps.
     pub steepness: f64,
@@ -39,8 +41,11 @@ impl Verdict {
 }
 
 /// Below this share of another frame's fine structure a frame is blurred: a blur of 2 px halves the energy of one-pixel differences
-/// across its direction. In place, sharp frames measure 0.74 and more, shaken ones 0.63 and less.
-const DETAIL: f64 = 0.68;
+/// across its direction. In place, sharp frames measure 0.74 and more, shaken ones 0.71 and less.
+const DETAIL: f64 = 0.72;
+/// Share of the fine structure of a frame that is sharp, as it measures without any error, from which another is as well. In place, sharp frames
+/// measure 0.73 and more where scenes are real, 0.98 and more where they are drawn; shaken ones that few pixels speak for 0.5 to 0.8.
+const LIKELY: f64 = 0.65;
 /// Below this no edge is steep: even the best frame is blurred.
 const STEEPNESS: f64 = 0.335;
 /// Relative error of the noise level that is taken off the energies.
@@ -59,6 +64,8 @@ const COARSE: usize = 24;
 const DIRECTIONS: [(usize, usize, bool); 4] = [(1, 0, false), (0, 1, false), (1, 1, false), (1, 1, true)];
 /// Side in pixels of the squares whose structure is compared.
 const BLOCK: usize = 16;
+/// Fewest pixels that both see from which anything is told.
+const FEW: usize = BLOCK * BLOCK;
 /// Radius in pixels of the squares over which light is compared.
 const LOCAL: usize = 4;
 /// Relative difference up to which two frames see the same light there: blur moves light within the square, and a lamp's trail brings in
@@ -272,36 +279,68 @@ fn energy(a: &Luminance, b: &Luminance, shared: &[bool], direction: (usize, usiz
     Energy { sum: blocks.iter().sum(), error: 2.0 * scatter.sqrt() + a.noise_error * noise, doubtful, blocks }
 }
 
-/// Fine structure of a frame as a part of another's, at most that: with the error of its own and without what is doubtful of the other's, and
-/// two standard errors of what the squares of the frame say, each by itself, since what a few of them say may be a trail's. `None` where the other's does not stand clear of noise.
-fn share(own: &Energy, other: &Energy) -> Option<f64> {
+/// Fine structure of a frame as a part of another's.
+#[derive(Clone, Copy)]
+struct Share {
+    likely: f64,
+    /// With the error of its own and two standard errors of what the squares of the frame say, each by itself, since what a few of them say may be
+    /// a trail's; without what is doubtful of the other's.
+    most: f64,
+}
+
+/// `None` where the other's does not stand clear of noise, or squares disagree by so much that a frame without any would pass.
+fn share(own: &Energy, other: &Energy) -> Option<Share> {
     if other.sum <= 3.0 * other.error || other.sum <= 3.0 * own.error {
         return None;
     }
-    let share = (own.sum + own.error).max(0.0) / (other.sum - other.doubtful);
-    let scatter: f64 = own.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - share * b).powi(2)).sum();
-    Some(share + 2.0 * scatter.sqrt() / other.sum)
+    let likely = own.sum.max(0.0) / (other.sum - other.doubtful);
+    let most = (own.sum + own.error).max(0.0) / (other.sum - other.doubtful);
+    let scatter: f64 = own.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - most * b).powi(2)).sum();
+    let doubt = 2.0 * scatter.sqrt() / other.sum;
+    (doubt < DETAIL).then_some(Share { likely, most: most + doubt })
 }
 
-/// [`Verdict::detail`] of two frames against each other, as a whole and the pixels of each that are `looked` at, `motion` being the way from the
-/// first's pixels to the second's; `None` where nothing tells.
-fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, looked: &Looked) -> [Option<f64>; 2] {
+/// Shares of two frames in each other's fine structure, in the direction in which they are least, as a whole and the pixels of each that are
+/// `looked` at, `motion` being the way from the first's pixels to the second's; `None` where nothing tells.
+fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, looked: &Looked) -> [Option<Share>; 2] {
     // Each of the two on its own pixels, of which those count that the other sees as well.
     let apart = *motion != DMat3::IDENTITY;
     let (b_seen, a_seen) = (apart.then(|| whole[1].seen(motion, looked)), apart.then(|| whole[0].seen(&motion.inverse(), looked)));
     let (b_seen, a_seen) = (b_seen.as_ref().unwrap_or(b), a_seen.as_ref().unwrap_or(a));
     let on_a = a.shared(b_seen);
     let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
+    if [&on_a, &on_b].iter().any(|on| on.iter().filter(|s| **s).count() < FEW) {
+        return [None; 2];
+    }
     let along = |&direction: &(usize, usize, bool)| {
         let of = |lag| [energy(a, b_seen, &on_a, direction, lag), energy(b, a_seen, &on_b, direction, lag)];
         let (fine, coarse) = (of(1), of(COARSE));
         // A response or exposure time that is not quite true changes structure of all sizes alike; blur takes the finest.
         let known = coarse[0].sum > 0.0 && coarse[1].sum > 0.0;
         let contrast = |i: usize, j: usize| if known { (coarse[i].sum / coarse[j].sum).min(1.0) } else { 1.0 };
-        [(0, 1), (1, 0)].map(|(i, j)| share(&fine[i], &fine[j]).map(|share| share / contrast(i, j)))
+        let of = |(i, j): (usize, usize)| {
+            let contrast = contrast(i, j);
+            share(&fine[i], &fine[j]).map(|s| Share { likely: s.likely / contrast, most: s.most / contrast })
+        };
+        [(0, 1), (1, 0)].map(of)
     };
-    let least = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b).reduce(f64::min);
+    let least = |a: Option<Share>, b: Option<Share>| {
+        a.into_iter().chain(b).reduce(|a, b| Share { likely: a.likely.min(b.likely), most: a.most.min(b.most) })
+    };
     DIRECTIONS.par_iter().map(along).reduce(|| [None; 2], |x, y| [least(x[0], y[0]), least(x[1], y[1])])
+}
+
+/// Those of `frames` to which no way leads from the one to `begin` with, by frames each of which `is_like` the one before.
+fn unreached(frames: &[usize], begin: Option<usize>, is_like: impl Fn(usize, usize) -> bool) -> Vec<usize> {
+    let (mut reached, mut others): (Vec<usize>, Vec<usize>) = frames.iter().partition(|&&i| Some(i) == begin);
+    let mut next = 0;
+    while next < reached.len() {
+        let (like, rest): (Vec<usize>, Vec<usize>) = others.into_iter().partition(|&i| is_like(i, reached[next]));
+        reached.extend(like);
+        others = rest;
+        next += 1;
+    }
+    others
 }
 
 /// [`Verdict::steepness`] and [`Verdict::evenness`].
@@ -333,7 +372,7 @@ pub fn triage(
     let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).zip(curves).map(|((f, x), c)| luminance(f, x, c)).collect();
     let verdict = |a: &Luminance| {
         let (steepness, evenness) = steepness(&a.part(&looked));
-        Verdict { sharp: false, detail: 1.0, compared: false, steepness, evenness, reason: String::new() }
+        Verdict { sharp: false, detail: 1.0, compared: false, linked: true, steepness, evenness, reason: String::new() }
     };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
@@ -343,17 +382,26 @@ pub fn triage(
     let pairs: Vec<(usize, usize)> =
         (0..all.len()).flat_map(|j| (0..j).map(move |i| (i, j))).filter(|&(i, j)| !(excluded[i] && excluded[j])).collect();
     let of = |&(i, j): &(usize, usize)| details([&all[i], &all[j]], [&parts[i], &parts[j]], &(motions[j] * motions[i].inverse()), &looked);
-    let found: Vec<[Option<f64>; 2]> = pairs.iter().map(of).collect();
+    let found: Vec<[Option<Share>; 2]> = pairs.iter().map(of).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
         for (k, own, other) in [(0, i, j), (1, j, i)] {
             if !excluded[other]
                 && let Some(detail) = detail[k]
             {
-                verdicts[own].detail = verdicts[own].detail.min(detail);
+                verdicts[own].detail = verdicts[own].detail.min(detail.most);
                 verdicts[own].compared = true;
                 verdicts[other].compared = true;
             }
         }
+    }
+    let likely = |own: usize, other: usize| {
+        let pair = pairs.iter().position(|&(i, j)| (i, j) == (own.min(other), own.max(other)))?;
+        found[pair][usize::from(own > other)].map(|share| share.likely)
+    };
+    let passing: Vec<usize> = (0..all.len()).filter(|&i| !excluded[i] && verdicts[i].compared && verdicts[i].detail >= DETAIL).collect();
+    let shortest = passing.iter().copied().min_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
+    for i in unreached(&passing, shortest, |own, other| likely(own, other).is_some_and(|share| share >= LIKELY)) {
+        verdicts[i].linked = false;
     }
     for (i, v) in verdicts.iter_mut().enumerate() {
         if let Some(list) = given {
@@ -371,8 +419,9 @@ pub fn triage(
         }
     }
     // Deblurring a sharp frame loses next to nothing, taking a blurred one for sharp spoils the picture.
-    if given.is_none() && verdicts.iter().any(|v| v.sharp && v.compared) {
-        for v in verdicts.iter_mut().filter(|v| v.sharp && !v.compared) {
+    let tells = |v: &Verdict| v.compared && v.linked;
+    if given.is_none() && verdicts.iter().any(|v| v.sharp && tells(v)) {
+        for v in verdicts.iter_mut().filter(|v| v.sharp && !tells(v)) {
             v.sharp = false;
             v.reason = "shows no structure that a sharp frame sees clearly as well, to tell whether it is sharp".into();
         }

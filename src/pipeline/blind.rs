@@ -720,7 +720,7 @@ mod tests {
     use super::*;
 
     fn verdict(detail: f64, steepness: f64, sharp: bool) -> Verdict {
-        Verdict { sharp, detail, compared: true, steepness, evenness: 1.0, reason: String::new() }
+        Verdict { sharp, detail, compared: true, linked: true, steepness, evenness: 1.0, reason: String::new() }
     }
 
     #[test]
