@@ -21,7 +21,8 @@ pub struct Verdict {
     /// Whether fine structure of it or of another frame stood clear of the noise of both where they see the same light: else `detail` says
     /// nothing.
     pub compared: bool,
-    /// Whether that leads, by frames each of which clearly has as much as the one before, from the shortest of those with as much as any to this one.
+    /// Whether that leads to this frame, by frames each of which clearly has as much as the one before, from the shortest of those with as much as any,
+    /// or from two of which each clearly has as much as the other.
     pub linked: bool,
     /// Energy of one-pixel over that of two-pixel differences, worst direction: about 0.5 where edges are one pixel wide, 0.25 where
     /// they are ramps.
@@ -330,9 +331,11 @@ fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, look
     DIRECTIONS.par_iter().map(along).reduce(|| [None; 2], |x, y| [least(x[0], y[0]), least(x[1], y[1])])
 }
 
-/// Those of `frames` to which no way leads from the one to `begin` with, by frames each of which `is_like` the one before.
+/// Those of `frames` to which no way leads, by frames each of which `is_like` the one before, from the one to `begin` with, nor from any two that are
+/// each like the other.
 fn unreached(frames: &[usize], begin: Option<usize>, is_like: impl Fn(usize, usize) -> bool) -> Vec<usize> {
-    let (mut reached, mut others): (Vec<usize>, Vec<usize>) = frames.iter().partition(|&&i| Some(i) == begin);
+    let is_one_of_two = |i: usize| frames.iter().any(|&j| j != i && is_like(i, j) && is_like(j, i));
+    let (mut reached, mut others): (Vec<usize>, Vec<usize>) = frames.iter().partition(|&&i| Some(i) == begin || is_one_of_two(i));
     let mut next = 0;
     while next < reached.len() {
         let (like, rest): (Vec<usize>, Vec<usize>) = others.into_iter().partition(|&i| is_like(i, reached[next]));
