@@ -427,6 +427,7 @@ fn a_frame_of_another_scene_is_left_out_by_name() {
     assert!(said.contains("frame2.png: no camera shake explains it"), "{said}");
     assert_eq!(column(&report, "registration")[1]["method"], "skipped");
     assert_eq!(column(&report, "used"), [true, false, true]);
+    assert_eq!(call("--no-align --strict").status.code(), Some(3));
 }
 
 #[test]
