@@ -7,10 +7,10 @@ fn store(i: i32, value: vec3f) {
 
 @compute @workgroup_size(32, 4)
 fn main(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u) {
+    let size = params.out_size;
     let p = vec2i(i32(id.x), i32(id.y) * TALL);
-    if any(p >= params.out_size) {
-        return;
+    let sum = taps(params.in_stride, 0, p, params.first_group + group.z, 1u);
+    if p.x < size.x {
+        keep(size.x, (i32(group.z) * size.y + p.y) * size.x + p.x, size.y - p.y, sum);
     }
-    let sum = taps(p, params.first_group + group.z, 1u);
-    keep((i32(group.z) * params.out_size.y + p.y) * params.out_size.x + p.x, params.out_size.y - p.y, sum);
 }

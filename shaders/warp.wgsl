@@ -1,14 +1,31 @@
-// Rotate-then-shift: one base warp per plane of the output (workgroup z).
+// Rotate-then-shift: one base warp per plane of the output (workgroup z). WIDE pixels of a row per invocation, ACROSS apart: what a warp
+// needs to know of its base is then read once for all, and neighbouring invocations still write neighbouring pixels.
+const WIDE: i32 = 8;
+const ACROSS: i32 = 32;
+
 @group(0) @binding(3) var planes: texture_storage_2d<rgba32float, write>;
 
-@compute @workgroup_size(16, 8)
-fn main(@builtin(global_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u) {
-    let p = vec2i(id.xy);
-    if any(p >= params.out_size) {
-        return;
+@compute @workgroup_size(32, 4)
+fn main(@builtin(local_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u) {
+    let size = params.out_size;
+    let origin = params.out_origin;
+    let grid = Grid(params.centre, params.offset, params.in_size);
+    let base = params.first_base + group.z;
+    let abc = bases[base].abc;
+    let def = bases[base].def;
+    let y = i32(group.y) * 4 + i32(id.y);
+    let first = group.z * u32(size.x * size.y) + u32(y * size.x);
+    let end = min(size.x, i32(group.x + 1u) * WIDE * ACROSS);
+    var x = i32(group.x) * WIDE * ACROSS + i32(id.x);
+    // The loop ends at its end: some drivers run what follows a break once more, for nobody.
+    loop {
+        let value = source(grid, abc, def, vec2i(x, y) + origin);
+        if x < end && y < size.y {
+            textureStore(planes, texel(first + u32(x)), vec4f(value, 0.0));
+        }
+        x += ACROSS;
+        if x >= end {
+            break;
+        }
     }
-    let b = params.first_base + group.z;
-    let value = source(bases[b].abc, bases[b].def, p + params.out_origin);
-    let i = group.z * u32(params.out_size.x * params.out_size.y) + at(p, params.out_size.x);
-    textureStore(planes, texel(i), vec4f(value, 0.0));
 }

@@ -154,6 +154,11 @@ fn main() {
         times[3].push(time(|| cpu.adjoint(&image, &mut out)));
     }
     let [k, k_cpu, t, t_cpu] = times.each_mut().map(|r| median(r));
+    let parts = |steps: &[Step]| {
+        let each = steps.iter().map(|s| median(&mut (0..rounds).map(|_| time(|| device.run(std::slice::from_ref(s)))).collect::<Vec<_>>()));
+        each.map(|t| format!("{t:.0}")).collect::<Vec<_>>().join(" + ")
+    };
+    println!("Step by step, ms: K {}; its adjoint {}", parts(&device.forward), parts(&device.adjoint));
     println!("| | device, ms | CPU, ms | ratio |\n|---|---|---|---|");
     println!("| K | {k:.0} | {k_cpu:.0} | {:.2} |\n| adjoint of K | {t:.0} | {t_cpu:.0} | {:.2} |", k / k_cpu, t / t_cpu);
 

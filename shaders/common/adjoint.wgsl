@@ -23,3 +23,11 @@ struct Params {
 @group(0) @binding(3) var<storage, read_write> latent_r: array<f32>;
 @group(0) @binding(4) var<storage, read_write> latent_g: array<f32>;
 @group(0) @binding(5) var<storage, read_write> latent_b: array<f32>;
+
+fn add(i: u32, value: vec3f) {
+    latent_r[i] += value.x;
+    if CHANNELS > 1u {
+        latent_g[i] += value.y;
+        latent_b[i] += value.z;
+    }
+}

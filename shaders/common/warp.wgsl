@@ -27,14 +27,21 @@ fn row6(i: u32, w: vec4f, v: vec4f) -> vec3f {
     return row4(i, w) + v.x * pixel(i + 4u) + v.y * pixel(i + 5u);
 }
 
+// Params that `source` needs: some drivers load uniforms fast only where no branch or loop is open.
+struct Grid {
+    centre: vec2f,
+    offset: vec2i,
+    in_size: vec2i,
+}
+
 // E(H^-1 q).
-fn source(abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
-    let d = clamp(displacement(abc, def, vec2f(q) - params.centre), vec2f(-1e6), vec2f(1e6));
+fn source(grid: Grid, abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
+    let d = clamp(displacement(abc, def, vec2f(q) - grid.centre), vec2f(-1e6), vec2f(1e6));
     let whole = floor(d);
     let f = d - whole;
-    let first = clamp(q + params.offset + vec2i(whole) - (SUPPORT - 1), vec2i(0), params.in_size - 2 * SUPPORT);
-    let row = u32(params.in_size.x);
-    let i = at(first, params.in_size.x);
+    let first = clamp(q + grid.offset + vec2i(whole) - (SUPPORT - 1), vec2i(0), grid.in_size - 2 * SUPPORT);
+    let row = u32(grid.in_size.x);
+    let i = at(first, grid.in_size.x);
     if SUPPORT == 1 {
         let j = i + row;
         return mix(mix(pixel(i), pixel(i + 1u), f.x), mix(pixel(j), pixel(j + 1u), f.x), f.y);

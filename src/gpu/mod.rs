@@ -34,6 +34,8 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name, backend and driver in one line.
     pub description: String,
+    /// Whether the adapter is a software rasteriser.
+    pub software: bool,
     /// Pixels times taps that one dispatch may compute: bounds its time, so that a slow driver's watchdog does not fire.
     pub dispatch_budget: f64,
     /// Most bytes that one binding may hold.
@@ -168,11 +170,22 @@ impl Gpu {
 
     fn on(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Self {
         let info = adapter.get_info();
-        let dispatch_budget = if info.device_type == wgpu::DeviceType::Cpu { BUDGET_CPU } else { BUDGET_GPU };
+        let software = info.device_type == wgpu::DeviceType::Cpu;
+        let dispatch_budget = if software { BUDGET_CPU } else { BUDGET_GPU };
         let limits = device.limits();
         let binding_limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let description = describe(&info);
-        Self { device, queue, description, dispatch_budget, binding_limit, memory_limit: u64::MAX, counted: AtomicU64::new(0), turns: None }
+        Self {
+            device,
+            queue,
+            description,
+            software,
+            dispatch_budget,
+            binding_limit,
+            memory_limit: u64::MAX,
+            counted: AtomicU64::new(0),
+            turns: None,
+        }
     }
 
     /// A device that others draw on as well. Work is submitted in small turns, two at a time, so that what they draw

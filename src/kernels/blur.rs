@@ -16,6 +16,8 @@ use glam::{DMat3, DVec2};
 use std::ops::Range;
 use std::sync::OnceLock;
 
+/// How pixels of scratch are read, on GPUs and by software rasterisers.
+const IMAGE: [&str; 2] = [source!("common/image"), source!("common/image_storage")];
 pub(super) const PADDED: &str = source!("common/plane", "common/texels", "padded");
 pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/image", "common/pose", "common/warp", "warp");
 pub(super) const WARP_DIRECT: &str =
@@ -137,8 +139,10 @@ impl BlurKernels {
             let (support, together) = (("SUPPORT", self.support as f64), ("CHANNELS", channels as f64));
             // The format of a storage texture is part of its type, which no constant changes.
             let format = if channels > 1 { "rgba32float" } else { "r32float" };
-            let kernel =
-                |label, source: &str, constants: &[(&str, f64)]| Kernel::new(gpu, label, &source.replace("rgba32float", format), constants);
+            let image = IMAGE[usize::from(gpu.software)];
+            let kernel = |label, source: &str, constants: &[(&str, f64)]| {
+                Kernel::new(gpu, label, &source.replace(IMAGE[0], image).replace("rgba32float", format), constants)
+            };
             let adding = |label, source, constants: &[(&'static str, f64)]| {
                 [0.0, 1.0].map(|add| kernel(label, source, &[constants, &[("ACCUMULATE", add)]].concat()))
             };
@@ -162,17 +166,18 @@ fn displacement_table(h: &DMat3) -> ([f32; 4], [f32; 4]) {
     ([(x.x - 1.0) as f32, y.x as f32, z.x as f32, x.z as f32], [x.y as f32, (y.y - 1.0) as f32, z.y as f32, y.z as f32])
 }
 
-/// Over a frame's corners and centre: the largest absolute row sum of the Jacobian of `h` (how far a unit square spreads) and the largest
-/// change of the displacement `h p - p` per pixel in x.
+/// Over a frame's corners and centre: the largest absolute row sum of the Jacobian of `h` (how far a unit square spreads), and the largest
+/// change of the displacement `h p - p` over half a tile of shaders/warp_adjoint_near.wgsl.
 fn spread(h: &DMat3, half: DVec2) -> (f64, f64) {
     let (mut worst, mut drift) = (0.0f64, 0.0f64);
+    let tile = DVec2::new(NEAR.0 as f64 - 1.0, NEAR.1 as f64 - 1.0) / 2.0;
     for s in [DVec2::ZERO, DVec2::new(1.0, 1.0), DVec2::new(-1.0, 1.0), DVec2::new(1.0, -1.0), DVec2::new(-1.0, -1.0)] {
         let p = s * half;
         let (a, e) = (crate::pose::project(h, p), 0.5);
         let dx = (crate::pose::project(h, p + DVec2::new(e, 0.0)) - a) / e;
         let dy = (crate::pose::project(h, p + DVec2::new(0.0, e)) - a) / e;
         worst = worst.max(dx.x.abs() + dy.x.abs()).max(dx.y.abs() + dy.y.abs());
-        drift = drift.max((dx.x - 1.0).abs()).max(dx.y.abs());
+        drift = drift.max(tile.x * (dx.x - 1.0).abs() + tile.y * dy.x.abs()).max(tile.x * dx.y.abs() + tile.y * (dy.y - 1.0).abs());
     }
     (worst, drift)
 }
@@ -297,6 +302,10 @@ const TABLE: usize = 4096;
 const GROUP_TAPS: usize = 3000;
 /// Pixels of a column that one invocation of shaders/common/taps.wgsl makes.
 const TALL: usize = 16;
+/// Pixels that one workgroup of shaders/warp.wgsl makes.
+const WARP_TILE: (usize, usize) = (256, 4);
+/// Pixels that one invocation of shaders/warp_adjoint_near.wgsl makes.
+const NEAR: (usize, usize) = (4, 2);
 /// Zeros around the copy of the latent grid: at least the width of an interpolation.
 const MARGIN: usize = 8;
 /// Zero columns on either side of the adjoint's planes: at least the window of shaders/warp_adjoint_near.wgsl.
@@ -313,12 +322,13 @@ struct Chunk {
     adjoint: wgpu::Buffer,
 }
 
-/// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/common/taps.wgsl.
+/// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/common/taps.wgsl: three taps to an entry.
 fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
     for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
-        let weight = |m: usize| run.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
-        table.push([run[0].1 * stride as i32 + run[0].0, run.len() as i32, weight(0), weight(1)]);
-        table.extend((2..run.len()).step_by(4).map(|m| std::array::from_fn(|c| weight(m + c))));
+        table.extend(run.chunks(3).map(|part| {
+            let weight = |m: usize| part.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
+            [part[0].1 * stride as i32 + part[0].0, weight(0), weight(1), weight(2)]
+        }));
     }
 }
 
@@ -339,9 +349,9 @@ impl Blur {
         let s = kernels.support as f64;
         let spreads: Vec<(f64, f64)> = taps.bases.iter().map(|h| spread(h, half)).collect();
         let reach = spreads.iter().map(|d| (s * d.0 + 0.5).floor() as i32).max().unwrap_or(0);
-        // The window's centre is within half a pixel of the target of the middle of four pixels, the targets of each of which lie within
+        // The window's centre is within half a pixel of the target of the middle of a tile, the targets of each of whose pixels lie within
         // `s` times the row sum of its own; together less than the next whole pixel.
-        let near = spreads.iter().all(|d| s * d.0 + 0.5 + 1.5 * d.1 < s + 0.99);
+        let near = spreads.iter().all(|d| s * d.0 + 0.5 + d.1 < s + 0.99);
         let mut blur = Self {
             latent: (frame.0 + 2 * pad, frame.1 + 2 * pad),
             frame,
@@ -630,7 +640,7 @@ impl Blur {
                     steps.push(kernel.step_parts(gpu, &params, &[table, copy, x, y, z], grid(params.out_size, (16, 8), 1)));
                     continue;
                 };
-                steps.push(kernels.warp.step_parts(gpu, &params, &[table, copy, planes.clone()], grid(params.out_size, (16, 8), n)));
+                steps.push(kernels.warp.step_parts(gpu, &params, &[table, copy, planes.clone()], grid(params.out_size, WARP_TILE, n)));
                 let params = TapParams {
                     out_size: [self.frame.0 as i32, (to - from) as i32],
                     in_stride: width as i32,
@@ -707,10 +717,11 @@ impl Blur {
                     params.plane = 0;
                     scratch.copy.binding()
                 };
-                let (kernel, wide) = if self.near { (&kernels.warp_adjoint_near, 64) } else { (&kernels.warp_adjoint, 16) };
+                let near = (16 * NEAR.0, 8 * NEAR.1);
+                let (kernel, tile) = if self.near { (&kernels.warp_adjoint_near, near) } else { (&kernels.warp_adjoint, (16, 8)) };
                 let [x, y, z] = target.clone();
                 let parts = [self.bases(first), source, x, y, z];
-                steps.push(kernel.step_parts(gpu, &params, &parts, grid([params.size[0], rows.len() as i32], (wide, 8), 1)));
+                steps.push(kernel.step_parts(gpu, &params, &parts, grid([params.size[0], rows.len() as i32], tile, 1)));
             }
         }
         steps
