@@ -3,9 +3,14 @@
 fn main(@builtin(global_invocation_id) id: vec3u) {
     let size = params.out_size;
     let first = params.out_first;
+    let row = params.in_stride;
+    let plane = params.in_plane;
+    let group = params.first_group;
+    let span = params.span;
     let p = vec2i(i32(id.x), i32(id.y) * TALL);
-    let sum = taps(params.in_stride, params.in_plane, p, params.first_group, params.span);
-    if p.x < size.x {
-        keep(size.x, (p.y + first) * size.x + p.x, size.y - p.y, sum);
+    if any(p >= size) {
+        return;
     }
+    let sum = taps(row, plane, p, group, span);
+    keep(size.x, (p.y + first) * size.x + p.x, size.y - p.y, sum);
 }

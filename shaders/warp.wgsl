@@ -17,12 +17,12 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(workgroup_id) group: v
     let first = group.z * u32(size.x * size.y) + u32(y * size.x);
     let end = min(size.x, i32(group.x + 1u) * WIDE * ACROSS);
     var x = i32(group.x) * WIDE * ACROSS + i32(id.x);
+    if x >= end || y >= size.y {
+        return;
+    }
     // The loop ends at its end: some drivers run what follows a break once more, for nobody.
     loop {
-        let value = source(grid, abc, def, vec2i(x, y) + origin);
-        if x < end && y < size.y {
-            textureStore(planes, texel(first + u32(x)), vec4f(value, 0.0));
-        }
+        textureStore(planes, texel(first + u32(x)), vec4f(source(grid, abc, def, vec2i(x, y) + origin), 0.0));
         x += ACROSS;
         if x >= end {
             break;

@@ -27,9 +27,5 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         }
     }
     let o = at(p - vec2i(0, params.out_first), params.size.x);
-    latent_r[o] += params.factor * sum.x;
-    if CHANNELS > 1u {
-        latent_g[o] += params.factor * sum.y;
-        latent_b[o] += params.factor * sum.z;
-    }
+    add(o, params.factor * sum);
 }

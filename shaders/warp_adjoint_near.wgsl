@@ -15,12 +15,15 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let end = params.first_base + params.bases;
     let p = vec2i(i32(id.x) * 4, i32(id.y) * 2 + rows.x);
     let source = p - params.pad; // in frame pixels
+    var b = params.first_base;
+    if p.x >= size.x || p.y >= rows.y {
+        return;
+    }
     let middle = vec2f(source) + vec2f(1.5, 0.5) - centre;
     let corner = in_size - vec2i(4 + 2 * SUPPORT, 1);
     // Sums of red, green and blue, of the upper and the lower row.
     var upper = mat3x4f();
     var lower = mat3x4f();
-    var b = params.first_base;
     var first_pixel = 0u; // of the base's plane
     loop {
         let base = bases[b];
@@ -63,11 +66,11 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let o = at(p - vec2i(0, out_first), size.x);
     for (var k = 0; k < 4; k += 1) {
         // Each pixel has its own guard: an overrun would write into the next row.
-        if p.x + k < size.x && p.y < rows.y {
+        if p.x + k < size.x {
             add(o + u32(k), factor * vec3f(upper[0][k], upper[1][k], upper[2][k]));
-        }
-        if p.x + k < size.x && p.y + 1 < rows.y {
-            add(o + u32(k + size.x), factor * vec3f(lower[0][k], lower[1][k], lower[2][k]));
+            if p.y + 1 < rows.y {
+                add(o + u32(k + size.x), factor * vec3f(lower[0][k], lower[1][k], lower[2][k]));
+            }
         }
     }
 }

@@ -243,26 +243,29 @@ fn scratch_is_shared_without_traces() {
 fn scratch_reads_the_same_as_either_kind_of_texture() {
     let (frame, pad) = ((67, 31), 5);
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
-    let blurred = |software: bool, interpolation: Interpolation, tsf: &Tsf| {
+    let gpus = [true, false].map(|software| {
         let mut gpu = Gpu::new().expect("an adapter");
         gpu.software = software;
+        gpu
+    });
+    let blurred = |gpu: &Gpu, interpolation: Interpolation, tsf: &Tsf| {
         let kernels = BlurKernels::new(interpolation);
         let mut all = Vec::new();
         for taps in [TapSet::shifted(tsf, frame.0, frame.1, interpolation), TapSet::direct(tsf, frame.0, frame.1)] {
-            let blur = Blur::new(&gpu, &kernels, &taps, frame, pad);
-            let scratch = Scratch::new(&gpu, blur.scratch_wanted(), 3).expect("fits");
+            let blur = Blur::new(gpu, &kernels, &taps, frame, pad);
+            let scratch = Scratch::new(gpu, blur.scratch_wanted(), 3).expect("fits");
             let latent = [1u64, 2, 3].map(|seed| gpu.upload("latent", &noise(seed, n)).expect("fits"));
-            let (out, back) = (channels(&gpu, "frame", m).expect("fits"), channels(&gpu, "back", n).expect("fits"));
-            gpu.submit(&blur.forward(&gpu, &kernels, &scratch, &latent, &out));
-            gpu.submit(&blur.adjoint(&gpu, &kernels, &scratch, &out, &back, 1.0));
-            all.extend(out.iter().flat_map(|b| unshaken::gpu::read(&gpu, b, m).expect("the device answers")));
-            all.extend(back.iter().flat_map(|b| unshaken::gpu::read(&gpu, b, n).expect("the device answers")));
+            let (out, back) = (channels(gpu, "frame", m).expect("fits"), channels(gpu, "back", n).expect("fits"));
+            gpu.submit(&blur.forward(gpu, &kernels, &scratch, &latent, &out));
+            gpu.submit(&blur.adjoint(gpu, &kernels, &scratch, &out, &back, 1.0));
+            all.extend(out.iter().flat_map(|b| unshaken::gpu::read(gpu, b, m).expect("the device answers")));
+            all.extend(back.iter().flat_map(|b| unshaken::gpu::read(gpu, b, n).expect("the device answers")));
         }
         all
     };
     for (name, tsf) in motions(frame.0).into_iter().filter(|m| ["rotations", "large rotation"].contains(&m.0)) {
         for interpolation in ALL {
-            let (storage, sampled) = (blurred(true, interpolation, &tsf), blurred(false, interpolation, &tsf));
+            let [storage, sampled] = gpus.each_ref().map(|gpu| blurred(gpu, interpolation, &tsf));
             assert!(storage.iter().any(|v| v.abs() > 0.1), "{name}: nothing was computed");
             let worst = storage.iter().zip(&sampled).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst < 1e-5, "{name}, {interpolation:?}: they differ by {worst}");
