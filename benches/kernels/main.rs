@@ -2,6 +2,7 @@
 //! same algorithm. The table at the end alternates between them in one run: on a machine that others use only its ratios mean something.
 
 mod rotate_shift;
+mod workload;
 
 use criterion::Criterion;
 use rotate_shift::RotateShift;
@@ -11,32 +12,11 @@ use unshaken::gpu::{Gpu, Step, read};
 use unshaken::image::{Plane, Rgb};
 use unshaken::kernels::{Blur, DeviceRgb, Kernels, NOISE_STEPS, Scratch, channels};
 use unshaken::pose::Pose;
-use unshaken::tsf::{Interpolation, Tap, TapSet, Tsf};
+use unshaken::tsf::{Interpolation, TapSet, Tsf};
+use workload::{noise, workload};
 
 /// Side of the workload's square frame, pixels.
 const SIDE: usize = 1024;
-
-/// 64 poses: 13 angles 1/4 degree apart, about 5 whole-pixel shifts of a random walk at each.
-fn workload() -> TapSet {
-    let mut state = 1u32;
-    let mut next = |n: u32| {
-        state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-        ((state >> 16) % n) as i32
-    };
-    let (mut taps, mut x, mut y) = (Vec::new(), 0, 0);
-    for base in 0..13 {
-        let count = if base == 6 { 4 } else { 5 };
-        let mut at = std::collections::BTreeSet::new();
-        while at.len() < count {
-            at.insert((y, x));
-            x = (x + next(3) - 1).clamp(-12, 12);
-            y = (y + next(3) - 1).clamp(-12, 12);
-        }
-        taps.extend(at.into_iter().map(|(dy, dx)| Tap { base, dx, dy, weight: 1.0 / 64.0 }));
-    }
-    let bases = (-6..=6).map(|k| Pose::planar(0.0, 0.0, 0.25 * f64::from(k), 1.0).rotation(1000.0)).collect();
-    TapSet { bases, taps }
-}
 
 struct Device {
     gpu: Gpu,
@@ -44,16 +24,6 @@ struct Device {
     back: DeviceRgb,
     forward: Vec<Step>,
     adjoint: Vec<Step>,
-}
-
-fn noise(seed: u32) -> Vec<f32> {
-    let mut state = seed;
-    (0..SIDE * SIDE)
-        .map(|_| {
-            state = state.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
-            (state >> 8) as f32 / (1u32 << 24) as f32
-        })
-        .collect()
 }
 
 impl Device {
@@ -122,7 +92,7 @@ fn observation(taps: &TapSet, image: &[Vec<f32>; 3]) -> (Observation, Rgb) {
 
 fn main() {
     let taps = workload();
-    let image = [noise(1), noise(2), noise(3)];
+    let image = [1, 2, 3].map(|seed| noise(seed, SIDE * SIDE));
     let device = Device::new(&taps, &image);
     let cpu = RotateShift::new(&taps, SIDE, SIDE);
     let mut out = image.clone();

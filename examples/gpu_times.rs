@@ -1,0 +1,104 @@
+//! Times of K, Kᵀ and an iteration of the conjugate gradients at several sizes, on the adapter that a merge would use:
+//! `cargo run --release --example gpu_times -- 1 12 24` (megapixels). `benches/peers.py --device cuda 1 12 24` times PyTorch at the same work.
+
+#[path = "../benches/kernels/workload.rs"]
+mod workload;
+
+use std::time::{Duration, Instant};
+use unshaken::deblur::{self, Observation, Settings};
+use unshaken::error::Result;
+use unshaken::gpu::{Gpu, Step, read};
+use unshaken::image::{Plane, Rgb};
+use unshaken::kernels::{Blur, Kernels, NOISE_STEPS, Scratch, channels};
+use unshaken::pose::Pose;
+use unshaken::tsf::{Interpolation, TapSet, Tsf};
+use workload::{noise, workload};
+
+/// How long each figure is measured at least.
+const LEAST: Duration = Duration::from_millis(200);
+/// Frames of the bracket whose iterations are timed; two of them shaken.
+const FRAMES: usize = 5;
+
+/// Milliseconds of one run of `steps`, of as many as fill [`LEAST`], queued behind one another.
+fn time(gpu: &Gpu, steps: &[Step], probe: &wgpu::Buffer) -> Result<f64> {
+    let run = |count: u32| {
+        let start = Instant::now();
+        for _ in 0..count {
+            gpu.submit(steps);
+        }
+        read(gpu, probe, 1)?;
+        Ok(start.elapsed())
+    };
+    run(1)?; // drivers compile at the first run
+    let mut count = 1;
+    loop {
+        let took = run(count)?;
+        if took > LEAST {
+            return Ok(took.as_secs_f64() * 1000.0 / f64::from(count));
+        }
+        count *= 2;
+    }
+}
+
+fn operators(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpolation) -> Result<(f64, f64)> {
+    let blur = Blur::new(gpu, kernels.blur(interpolation), &workload(), (side, side), 0);
+    let scratch = Scratch::new(gpu, blur.scratch_wanted(), 3)?;
+    let values = noise(1, side * side);
+    let latent = [0, 1, 2].map(|_| gpu.upload("latent", &values)).into_iter().collect::<Result<Vec<_>>>()?;
+    let (frame, back) = (channels(gpu, "frame", side * side)?, channels(gpu, "back", side * side)?);
+    let forward = blur.forward(gpu, kernels.blur(interpolation), &scratch, &latent, &frame);
+    let adjoint = blur.adjoint(gpu, kernels.blur(interpolation), &scratch, &latent, &back, 1.0);
+    for (name, steps) in [("K", &forward), ("adjoint", &adjoint)] {
+        let parts: Result<Vec<f64>> = steps.iter().map(|s| time(gpu, std::slice::from_ref(s), &back[0])).collect();
+        let parts: Vec<String> = parts?.iter().map(|t| format!("{t:.3}")).collect();
+        println!("  {name}, {interpolation:?}, step by step: {} ms", parts.join(" + "));
+    }
+    Ok((time(gpu, &forward, &frame[0])?, time(gpu, &adjoint, &back[0])?))
+}
+
+/// Milliseconds that one iteration takes: the difference between long and short solves.
+fn iteration(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpolation) -> Result<f64> {
+    let values = noise(1, side * side);
+    let plane = || Plane::from_vec(side, side, values.iter().map(|v| 0.1 + 0.8 * v).collect());
+    let poses = workload().taps.iter().map(|t| Pose::planar(f64::from(t.dx), f64::from(t.dy), 0.25 * (t.base as f64 - 6.0), t.weight)).collect();
+    let (still, moved) = (Tsf::identity(), Tsf::new(1000.0, poses)?);
+    println!("  {} taps", TapSet::new(&moved, side, side, interpolation).taps.len());
+    let frames: Result<Vec<Observation>> = (0..FRAMES)
+        .map(|f| {
+            Ok(Observation {
+                exposure: Rgb([plane()?, plane()?, plane()?]),
+                mask: Plane::filled(side, side, 1.0),
+                exposure_time: 1.0,
+                noise: std::array::from_fn(|_| vec![0.02; NOISE_STEPS]),
+                black_clipped: false,
+                tsf: if f < 2 { moved.clone() } else { still.clone() },
+            })
+        })
+        .collect();
+    let (frames, start) = (frames?, Rgb::filled(side, side, 0.5));
+    let solve = |inner: usize| {
+        let settings = Settings { outer: 1, inner, interpolation, ..Settings::default() };
+        let from = Instant::now();
+        deblur::solve(gpu, kernels, &frames, &start, 0, &settings, &mut |_| true)?;
+        Ok(from.elapsed().as_secs_f64() * 1000.0)
+    };
+    solve(1)?;
+    Ok((solve(42)? - solve(2)?) / 40.0)
+}
+
+fn main() -> Result<()> {
+    let gpu = Gpu::new()?;
+    println!("{}; 3 channels, 64 poses", gpu.description);
+    let sizes: Vec<f64> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
+    for megapixels in sizes {
+        let side = (megapixels * 1e6).sqrt() as usize;
+        println!("{megapixels} MP, {side} x {side}");
+        for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
+            let kernels = Kernels::new(&gpu);
+            let (k, adjoint) = operators(&gpu, &kernels, side, interpolation)?;
+            let iteration = iteration(&gpu, &kernels, side, interpolation)?;
+            println!("{megapixels} MP, {interpolation:?}: K {k:.3} ms, adjoint {adjoint:.3} ms; {FRAMES} frames, 2 shaken: iteration {iteration:.3} ms");
+        }
+    }
+    Ok(())
+}
