@@ -60,7 +60,8 @@ fn operators(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpola
 fn iteration(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpolation) -> Result<f64> {
     let values = noise(1, side * side);
     let plane = || Plane::from_vec(side, side, values.iter().map(|v| 0.1 + 0.8 * v).collect());
-    let poses = workload().taps.iter().map(|t| Pose::planar(f64::from(t.dx), f64::from(t.dy), 0.25 * (t.base as f64 - 6.0), t.weight)).collect();
+    let poses =
+        workload().taps.iter().map(|t| Pose::planar(f64::from(t.dx), f64::from(t.dy), 0.25 * (t.base as f64 - 6.0), t.weight)).collect();
     let (still, moved) = (Tsf::identity(), Tsf::new(1000.0, poses)?);
     println!("  {} taps", TapSet::new(&moved, side, side, interpolation).taps.len());
     let frames: Result<Vec<Observation>> = (0..FRAMES)
@@ -97,7 +98,9 @@ fn main() -> Result<()> {
             let kernels = Kernels::new(&gpu);
             let (k, adjoint) = operators(&gpu, &kernels, side, interpolation)?;
             let iteration = iteration(&gpu, &kernels, side, interpolation)?;
-            println!("{megapixels} MP, {interpolation:?}: K {k:.3} ms, adjoint {adjoint:.3} ms; {FRAMES} frames, 2 shaken: iteration {iteration:.3} ms");
+            println!(
+                "{megapixels} MP, {interpolation:?}: K {k:.3} ms, adjoint {adjoint:.3} ms; {FRAMES} frames, 2 shaken: iteration {iteration:.3} ms"
+            );
         }
     }
     Ok(())

@@ -13,8 +13,7 @@ struct Params {
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> in_r: array<f32>;
 @group(0) @binding(2) var<storage, read> in_g: array<f32>;
-@group(0) @binding(3) var<storage, read> in_b: array<f32>;
-@group(0) @binding(4) var out: texture_storage_2d<rgba32float, write>;
+@group(0) @binding(4) var<storage, read> in_b: array<f32>;
 
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u) {
@@ -32,5 +31,5 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
             v.z = in_b[i];
         }
     }
-    textureStore(out, texel(at(o, params.out_size.x)), vec4f(v, 0.0));
+    put(at(o, params.out_size.x), v);
 }

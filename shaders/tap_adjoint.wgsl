@@ -1,8 +1,6 @@
 // The adjoint of the taps, their shifts mirrored: the frame into one plane per base warp (workgroup z).
-@group(0) @binding(3) var planes: texture_storage_2d<rgba32float, write>;
-
 fn store(i: i32, value: vec3f) {
-    textureStore(planes, texel(u32(i)), vec4f(value, 0.0));
+    put(u32(i), value);
 }
 
 @compute @workgroup_size(32, 4)

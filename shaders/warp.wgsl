@@ -3,8 +3,6 @@
 const WIDE: i32 = 8;
 const ACROSS: i32 = 32;
 
-@group(0) @binding(3) var planes: texture_storage_2d<rgba32float, write>;
-
 @compute @workgroup_size(32, 4)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(workgroup_id) group: vec3u) {
     let size = params.out_size;
@@ -22,7 +20,7 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(workgroup_id) group: v
     }
     // The loop ends at its end: some drivers run what follows a break once more, for nobody.
     loop {
-        textureStore(planes, texel(first + u32(x)), vec4f(source(grid, abc, def, vec2i(x, y) + origin), 0.0));
+        put(first + u32(x), source(grid, abc, def, vec2i(x, y) + origin));
         x += ACROSS;
         if x >= end {
             break;

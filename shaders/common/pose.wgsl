@@ -12,7 +12,13 @@ struct Base {
     weight: vec4f,        // of what the warp adds, three times nothing
 }
 
+// Whether g and h are 0 for all bases.
+override PLANAR: bool = false;
+
 fn displacement(abc: vec4f, def: vec4f, p: vec2f) -> vec2f {
+    if PLANAR {
+        return vec2f(abc.x * p.x + abc.y * p.y + abc.z, def.x * p.x + def.y * p.y + def.z);
+    }
     let s = abc.w * p.x + def.w * p.y;
     let n = vec2f(abc.x * p.x + abc.y * p.y + abc.z - p.x * s, def.x * p.x + def.y * p.y + def.z - p.y * s);
     return n / (s + 1.0);

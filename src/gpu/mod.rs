@@ -34,7 +34,7 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name, backend and driver in one line.
     pub description: String,
-    /// Whether the adapter is a software rasteriser.
+    /// Whether the adapter is a software rasteriser: it loads from textures faster than from buffers, and gains nothing by workgroup memory.
     pub software: bool,
     /// Pixels times taps that one dispatch may compute: bounds its time, so that a slow driver's watchdog does not fire.
     pub dispatch_budget: f64,
@@ -58,13 +58,21 @@ struct Turns {
     last: Mutex<Option<(wgpu::SubmissionIndex, Instant, usize)>>,
 }
 
-/// An array of pixels in a texture, wrapped at rows of [`TEXEL_ROW`]; see shaders/common/texels.wgsl.
-pub struct Texels(wgpu::TextureView);
+/// An array of pixels, which kernels write and read.
+pub enum Texels {
+    /// On GPUs.
+    Buffer(wgpu::Buffer),
+    /// On software rasterisers, wrapped at rows of [`TEXEL_ROW`]; see shaders/common/texels.wgsl.
+    Texture(wgpu::TextureView),
+}
 
 impl Texels {
     /// The array as a kernel's input or output.
     pub fn binding(&self) -> wgpu::BindingResource<'_> {
-        wgpu::BindingResource::TextureView(&self.0)
+        match self {
+            Self::Buffer(buffer) => buffer.as_entire_binding(),
+            Self::Texture(view) => wgpu::BindingResource::TextureView(view),
+        }
     }
 }
 
@@ -78,6 +86,8 @@ pub struct Rows<'a> {
 
 /// Pixels per row of a texture that holds an array; shaders/common/texels.wgsl shifts by its logarithm.
 const TEXEL_ROW: usize = 4096;
+/// Workgroup memory that is asked for: more than 32 KiB few adapters have, and fewer workgroups then run beside each other.
+const WORKGROUP_BYTES: u32 = 32 << 10;
 /// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
 /// alignment that every adapter accepts.
 const ROW_STEP: usize = 64;
@@ -128,6 +138,7 @@ pub fn device_descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'sta
         max_storage_buffer_binding_size: available.max_storage_buffer_binding_size,
         max_buffer_size: available.max_buffer_size,
         max_texture_dimension_2d: available.max_texture_dimension_2d,
+        max_compute_workgroup_storage_size: available.max_compute_workgroup_storage_size.min(WORKGROUP_BYTES),
         ..wgpu::Limits::default()
     };
     wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() }
@@ -195,6 +206,19 @@ impl Gpu {
         Self { turns: Some(turns), ..Self::on(adapter, device, queue) }
     }
 
+    /// The same device, used as if it were a software rasteriser or as if it were none: each way of working runs on either.
+    pub fn treated_as(&self, software: bool) -> Self {
+        Self {
+            device: self.device.clone(),
+            queue: self.queue.clone(),
+            description: self.description.clone(),
+            software,
+            counted: AtomicU64::new(0),
+            turns: None,
+            ..*self
+        }
+    }
+
     /// The same with `bytes` of memory for planes at most, as on an adapter that has no more.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
         Self { memory_limit: bytes, ..self }
@@ -218,6 +242,11 @@ impl Gpu {
     /// Most `f32` that one storage binding may hold.
     pub fn max_binding(&self) -> usize {
         (self.binding_limit / 4) as usize
+    }
+
+    /// Most `f32` that workgroup memory may hold.
+    pub fn max_workgroup(&self) -> usize {
+        (self.device.limits().max_compute_workgroup_storage_size / 4) as usize
     }
 
     /// Most `f32` that one buffer may hold.
@@ -276,13 +305,15 @@ impl Gpu {
             return Err(Error::OutOfMemory(format!("{label}: {count} values are more than one buffer of this adapter holds")));
         }
         let size = (count.max(2) * 4) as u64;
-        self.allocate(label, size, || {
-            self.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some(label),
-                size,
-                usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            })
+        self.allocate(label, size, || self.storage(label, size))
+    }
+
+    fn storage(&self, label: &str, size: u64) -> wgpu::Buffer {
+        self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size,
+            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
         })
     }
 
@@ -299,7 +330,11 @@ impl Gpu {
 
     /// Most pixels that [`Gpu::texels`] may hold.
     pub fn max_texels(&self) -> usize {
-        TEXEL_ROW * self.device.limits().max_texture_dimension_2d as usize
+        if self.software {
+            TEXEL_ROW * self.device.limits().max_texture_dimension_2d as usize
+        } else {
+            self.max_binding() / 4 / TEXEL_ROW * TEXEL_ROW
+        }
     }
 
     /// Bytes of [`Gpu::texels`] of `count` pixels of `channels` channels, one or three: whole rows, and four values where there are three.
@@ -307,15 +342,20 @@ impl Gpu {
         (count.max(1).next_multiple_of(TEXEL_ROW) * if channels > 1 { 16 } else { 4 }) as u64
     }
 
-    /// An array of `count` pixels of `channels` channels, one or three, that kernels write as a storage texture and read as a texture.
+    /// An array of `count` pixels of `channels` channels, one or three, that kernels write and read: a buffer on GPUs, a storage texture on
+    /// software rasterisers.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`] when there are more than [`Gpu::max_texels`], or there is no room.
     pub fn texels(&self, label: &str, count: usize, channels: usize) -> Result<Texels> {
         if count > self.max_texels() {
-            return Err(Error::OutOfMemory(format!("{label}: {count} pixels are more than one texture of this adapter holds")));
+            return Err(Error::OutOfMemory(format!("{label}: {count} pixels are more than this adapter binds at once")));
         }
-        let texture = self.allocate(label, Self::texel_bytes(count, channels), || {
+        let bytes = Self::texel_bytes(count, channels);
+        if !self.software {
+            return self.allocate(label, bytes, || self.storage(label, bytes)).map(Texels::Buffer);
+        }
+        let texture = self.allocate(label, bytes, || {
             self.device.create_texture(&wgpu::TextureDescriptor {
                 label: Some(label),
                 size: wgpu::Extent3d { width: TEXEL_ROW as u32, height: count.max(1).div_ceil(TEXEL_ROW) as u32, depth_or_array_layers: 1 },
@@ -323,11 +363,11 @@ impl Gpu {
                 sample_count: 1,
                 dimension: wgpu::TextureDimension::D2,
                 format: if channels > 1 { wgpu::TextureFormat::Rgba32Float } else { wgpu::TextureFormat::R32Float },
-                usage: wgpu::TextureUsages::STORAGE_BINDING | wgpu::TextureUsages::TEXTURE_BINDING,
+                usage: wgpu::TextureUsages::STORAGE_BINDING,
                 view_formats: &[],
             })
         })?;
-        Ok(Texels(texture.create_view(&wgpu::TextureViewDescriptor::default())))
+        Ok(Texels::Texture(texture.create_view(&wgpu::TextureViewDescriptor::default())))
     }
 
     /// A storage buffer that holds `values`.

@@ -4,10 +4,13 @@
 //! * direct: every pose warped straight into the sum. For a set whose taps shift nothing (a pose of its own per tap), above all for a
 //!   frame with a single pose.
 //!
-//! Both run in bands of frame rows, as tall as scratch, bindings and the time that a dispatch may take allow. K computes a band of the
+//! * by tiles, on GPUs: rotate-then-shift in workgroup memory (src/kernels/tiles.rs). Needs no scratch; for warps that turn and stretch little.
+//!
+//! The first two run in bands of frame rows, as tall as scratch, bindings and the time that a dispatch may take allow. K computes a band of the
 //! frame from the scratch rows that its shifts reach; Kᵀ adds to the latent grid what a band of scratch rows holds. What either reads is
 //! copied with a margin of zeros first.
 
+use super::tiles::{TileKernels, Tiles};
 use crate::error::Result;
 use crate::gpu::{Gpu, Kernel, Step, Texels};
 use crate::tsf::{Interpolation, TapSet};
@@ -16,10 +19,15 @@ use glam::{DMat3, DVec2};
 use std::ops::Range;
 use std::sync::OnceLock;
 
-/// How pixels of scratch are read, on GPUs and by software rasterisers.
+/// How pixels of scratch are read and written, on GPUs and by software rasterisers.
 const IMAGE: [&str; 2] = [source!("common/image"), source!("common/image_storage")];
-pub(super) const PADDED: &str = source!("common/plane", "common/texels", "padded");
-pub(super) const WARP: &str = source!("common/plane", "common/texels", "common/image", "common/pose", "common/warp", "warp");
+const PLANES: [&str; 2] = [source!("common/planes"), source!("common/planes_storage")];
+/// What stands for a pixel of three channels, and of one, in those sources: types that no constant changes.
+const ONE_CHANNEL: [[(&str, &str); 2]; 2] =
+    [[("array<vec4f>", "array<f32>"), ("vec4f(value, 0.0)", "value.x")], [("rgba32float", "r32float"), ("", "")]];
+pub(super) const PADDED: &str = source!("common/plane", "common/texels", "common/planes", "padded");
+pub(super) const WARP: &str =
+    source!("common/plane", "common/texels", "common/image", "common/planes", "common/pose", "common/warp", "warp");
 pub(super) const WARP_DIRECT: &str =
     source!("common/plane", "common/texels", "common/image", "common/pose", "common/warp", "common/output", "warp_direct");
 pub(super) const WARP_ADJOINT: &str =
@@ -27,7 +35,7 @@ pub(super) const WARP_ADJOINT: &str =
 pub(super) const WARP_ADJOINT_NEAR: &str =
     source!("common/plane", "common/texels", "common/image", "common/pose", "common/adjoint", "warp_adjoint_near");
 pub(super) const TAP_SUM: &str = source!("common/texels", "common/image", "common/taps", "common/output", "tap_sum");
-pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/image", "common/taps", "tap_adjoint");
+pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/image", "common/planes", "common/taps", "tap_adjoint");
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -105,14 +113,18 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
 }
 
 pub(super) fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
-    ["warp", "warp_direct", "warp_adjoint", "warp_adjoint_near"].map(|s| (s, "Base", size_of::<BaseTable>())).to_vec()
+    ["warp", "warp_direct", "warp_adjoint", "warp_adjoint_near", "blur_tile", "blur_tile_adjoint"]
+        .map(|s| (s, "Base", size_of::<BaseTable>()))
+        .to_vec()
 }
 
 /// The compiled kernels of K and Kᵀ.
 pub struct BlurKernels {
-    support: usize,
+    pub(super) support: usize,
     /// For one channel and for three.
     compiled: [OnceLock<Compiled>; 2],
+    /// For one channel and for three, each for any base warps and for those that do not foreshorten.
+    pub(super) tiles: [[OnceLock<TileKernels>; 2]; 2],
 }
 
 struct Compiled {
@@ -130,19 +142,20 @@ struct Compiled {
 impl BlurKernels {
     /// Those of one interpolation, compiled when first used.
     pub fn new(interpolation: Interpolation) -> Self {
-        Self { support: interpolation.support(), compiled: Default::default() }
+        Self { support: interpolation.support(), compiled: Default::default(), tiles: Default::default() }
     }
 
     /// The kernels for `channels` channels at a time.
     fn compiled(&self, gpu: &Gpu, channels: usize) -> &Compiled {
         self.compiled[usize::from(channels > 1)].get_or_init(|| {
             let (support, together) = (("SUPPORT", self.support as f64), ("CHANNELS", channels as f64));
-            // The format of a storage texture is part of its type, which no constant changes.
-            let format = if channels > 1 { "rgba32float" } else { "r32float" };
-            let image = IMAGE[usize::from(gpu.software)];
-            let kernel = |label, source: &str, constants: &[(&str, f64)]| {
-                Kernel::new(gpu, label, &source.replace(IMAGE[0], image).replace("rgba32float", format), constants)
+            let kind = usize::from(gpu.software);
+            let own = |source: &str| {
+                let source = source.replace(IMAGE[0], IMAGE[kind]).replace(PLANES[0], PLANES[kind]);
+                let pixel = ONE_CHANNEL[kind].iter().filter(|p| channels == 1 && !p.0.is_empty());
+                pixel.fold(source, |source, p| source.replace(p.0, p.1))
             };
+            let kernel = |label, source: &str, constants: &[(&str, f64)]| Kernel::new(gpu, label, &own(source), constants);
             let adding = |label, source, constants: &[(&'static str, f64)]| {
                 [0.0, 1.0].map(|add| kernel(label, source, &[constants, &[("ACCUMULATE", add)]].concat()))
             };
@@ -183,7 +196,7 @@ fn spread(h: &DMat3, half: DVec2) -> (f64, f64) {
 }
 
 /// Rows that `h` maps the rectangle of `x` by `y` (centred pixels) to; `None` when part of it lies behind the camera.
-fn rows_of(h: &DMat3, x: (f64, f64), y: (f64, f64)) -> Option<(f64, f64)> {
+pub(super) fn rows_of(h: &DMat3, x: (f64, f64), y: (f64, f64)) -> Option<(f64, f64)> {
     let mut rows = (f64::INFINITY, f64::NEG_INFINITY);
     for p in [DVec2::new(x.0, y.0), DVec2::new(x.1, y.0), DVec2::new(x.0, y.1), DVec2::new(x.1, y.1)] {
         let q = *h * p.extend(1.0);
@@ -252,7 +265,7 @@ impl Scratch {
     }
 
     /// The rows `rows` of one or three images of `size` as the kernels' bindings of inputs or outputs, and the row that comes first in them.
-    fn rows<'a>(
+    pub(super) fn rows<'a>(
         &'a self,
         gpu: &Gpu,
         images: &'a [wgpu::Buffer],
@@ -269,22 +282,23 @@ impl Scratch {
 
 /// K of one frame, which maps the latent grid to the frame, and Kᵀ back.
 pub struct Blur {
-    latent: (usize, usize),
-    frame: (usize, usize),
-    pad: usize,
-    support: usize,
+    pub(super) latent: (usize, usize),
+    pub(super) frame: (usize, usize),
+    pub(super) pad: usize,
+    pub(super) support: usize,
     /// Smallest and largest shift in x and in y.
     shift_x: (i32, i32),
-    shift_y: (i32, i32),
+    pub(super) shift_y: (i32, i32),
     /// Homographies scene to frame, by entry of the base table.
-    homographies: Vec<DMat3>,
-    taps: usize,
+    pub(super) homographies: Vec<DMat3>,
+    pub(super) taps: usize,
     near: bool,
     reach: i32,
     direct: bool,
     base_table: wgpu::Buffer,
-    /// None in the direct design.
+    /// None in the direct design, or by tiles.
     chunks: Vec<Chunk>,
+    tiles: Option<Tiles>,
 }
 
 /// How an operator is cut: frame (or scratch) rows per band, bases per pass.
@@ -295,11 +309,11 @@ struct Cut {
 }
 
 /// Entries of the base table that are bound together: 40 KiB, and a multiple of every alignment.
-const BASES: usize = 512;
+pub(super) const BASES: usize = 512;
 /// `vec4i` of a tap table: what 64 KiB, the least that every adapter binds as a uniform, hold.
-const TABLE: usize = 4096;
+pub(super) const TABLE: usize = 4096;
 /// Taps of one group at most, so that even taps without neighbours (one entry each) fit a table.
-const GROUP_TAPS: usize = 3000;
+pub(super) const GROUP_TAPS: usize = 3000;
 /// Pixels of a column that one invocation of shaders/common/taps.wgsl makes.
 const TALL: usize = 16;
 /// Pixels that one workgroup of shaders/warp.wgsl makes.
@@ -312,7 +326,7 @@ const MARGIN: usize = 8;
 const SIDE: usize = 12;
 
 /// Shifts (dx, dy, weight) of one base warp, sorted.
-type Group = Vec<(i32, i32, f64)>;
+pub(super) type Group = Vec<(i32, i32, f64)>;
 
 /// Taps of consecutive base warps that share one table.
 struct Chunk {
@@ -323,7 +337,7 @@ struct Chunk {
 }
 
 /// Appends the runs of consecutive places in y of `taps` (x, y, weight), sorted, in the layout of shaders/common/taps.wgsl: three taps to an entry.
-fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
+pub(super) fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]>) {
     for run in taps.chunk_by(|a, b| a.0 == b.0 && a.1 + 1 == b.1) {
         table.extend(run.chunks(3).map(|part| {
             let weight = |m: usize| part.get(m).map_or(0, |t| (t.2 as f32).to_bits() as i32);
@@ -333,7 +347,7 @@ fn append_runs(taps: &[(i32, i32, f64)], stride: usize, table: &mut Vec<[i32; 4]
 }
 
 /// Workgroups that each make `tile` pixels, for `depth` images of `size`.
-fn grid(size: [i32; 2], tile: (usize, usize), depth: usize) -> [u32; 3] {
+pub(super) fn grid(size: [i32; 2], tile: (usize, usize), depth: usize) -> [u32; 3] {
     [(size[0] as usize).div_ceil(tile.0) as u32, (size[1] as usize).div_ceil(tile.1) as u32, depth as u32]
 }
 
@@ -366,6 +380,7 @@ impl Blur {
             direct,
             base_table: gpu.uniform("base warps", bytemuck::bytes_of(&BaseTable::zeroed())),
             chunks: Vec::new(),
+            tiles: None,
         };
         // A base warp with more taps than a table holds stands there several times; one without any, not at all.
         let (mut table, mut groups) = (Vec::new(), Vec::new());
@@ -382,7 +397,12 @@ impl Blur {
         }
         table.resize(table.len().next_multiple_of(BASES), BaseTable::zeroed());
         blur.base_table = gpu.uniform("base warps", bytemuck::cast_slice(&table));
-        if !direct {
+        if !direct && near && !gpu.software {
+            let spread = spreads.iter().map(|s| s.0).fold(1.0, f64::max);
+            let planar = table.iter().all(|b| [b.abc[3], b.def[3], b.abc_inverse[3], b.def_inverse[3]] == [0.0; 4]);
+            blur.tiles = Tiles::new(gpu, kernels.support, spread, planar, &groups);
+        }
+        if !direct && blur.tiles.is_none() {
             blur.chunks = blur.tables(gpu, &groups);
         }
         blur
@@ -446,12 +466,12 @@ impl Blur {
         self.frame.1 + self.shifts().1
     }
 
-    fn centre(&self) -> DVec2 {
+    pub(super) fn centre(&self) -> DVec2 {
         DVec2::new(self.frame.0 as f64 - 1.0, self.frame.1 as f64 - 1.0) / 2.0
     }
 
     /// Latent rows, as rows of the grid with `margin` more above and below, that K reads for the planes' rows `from..to` (frame pixels).
-    fn latent_rows(&self, from: i32, to: i32, margin: usize) -> Range<i32> {
+    pub(super) fn latent_rows(&self, from: i32, to: i32, margin: usize) -> Range<i32> {
         let (c, s) = (self.centre(), self.support as f64);
         let x = (f64::from(-self.shift_x.1) - c.x - 1.0, f64::from(-self.shift_x.1) + self.width(false) as f64 - c.x);
         let y = (f64::from(from) - c.y, f64::from(to) - 1.0 - c.y);
@@ -484,6 +504,9 @@ impl Blur {
     fn scratch_for(&self, cut: Cut) -> ScratchSize {
         let shifts = self.shifts().1;
         let copy = self.forward_copy(cut.rows).max((cut.rows + shifts) * self.copy_width());
+        if self.tiles.is_some() {
+            return ScratchSize::default();
+        }
         if self.direct {
             return ScratchSize { planes: 0, copy };
         }
@@ -502,6 +525,9 @@ impl Blur {
 
     /// Rows of the latent grid or of the frame that the lowest band reads or adds to at once: fewer cannot be bound.
     pub fn rows_at_once(&self) -> usize {
+        if let Some(tiles) = &self.tiles {
+            return self.tile_rows_at_once(tiles);
+        }
         (self.forward_copy(1) / (self.latent.0 + 2 * MARGIN)).max(self.adjoint_rows(1)).max(1 + self.shifts().1)
     }
 
@@ -566,7 +592,7 @@ impl Blur {
     }
 
     /// The entries of the base table that hold entry `first`, which is entry `first % BASES` of them.
-    fn bases(&self, first: usize) -> wgpu::BindingResource<'_> {
+    pub(super) fn bases(&self, first: usize) -> wgpu::BindingResource<'_> {
         let bytes = (BASES * size_of::<BaseTable>()) as u64;
         let offset = (first / BASES) as u64 * bytes;
         wgpu::BindingResource::Buffer(wgpu::BufferBinding { buffer: &self.base_table, offset, size: std::num::NonZero::new(bytes) })
@@ -593,7 +619,7 @@ impl Blur {
             in_first,
             _pad: 0,
         };
-        let parts = [r, g, b, scratch.copy.binding()];
+        let parts = [r, g, scratch.copy.binding(), b];
         kernels.padded.step_parts(gpu, &params, &parts, grid(params.out_size, (16, 8), 1))
     }
 
@@ -606,6 +632,9 @@ impl Blur {
         latent: &[wgpu::Buffer],
         frame: &[wgpu::Buffer],
     ) -> Vec<Step> {
+        if let Some(tiles) = &self.tiles {
+            return self.forward_tiles(gpu, kernels, tiles, scratch, latent, frame);
+        }
         let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();
@@ -668,6 +697,9 @@ impl Blur {
         latent: &[wgpu::Buffer],
         factor: f32,
     ) -> Vec<Step> {
+        if let Some(tiles) = &self.tiles {
+            return self.adjoint_tiles(gpu, kernels, tiles, scratch, frame, latent, factor);
+        }
         let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);
         let mut steps = Vec::new();

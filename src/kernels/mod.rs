@@ -9,6 +9,7 @@ mod blur;
 mod data;
 mod display;
 mod linear;
+mod tiles;
 
 pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
 pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, UNSEEN, WeightTarget};
@@ -65,6 +66,8 @@ pub const SHADERS: &[(&str, &str)] = &[
     ("warp_adjoint_near", blur::WARP_ADJOINT_NEAR),
     ("tap_sum", blur::TAP_SUM),
     ("tap_adjoint", blur::TAP_ADJOINT),
+    ("blur_tile", tiles::BLUR_TILE),
+    ("blur_tile_adjoint", tiles::BLUR_TILE_ADJOINT),
     ("weights", data::WEIGHTS),
     ("misfit", data::MISFIT),
     ("gauss", data::GAUSS),
@@ -86,7 +89,7 @@ pub const SHADERS: &[(&str, &str)] = &[
 
 /// Sizes of the Rust mirrors of the shaders' `Params` as (shader, bytes), to be compared with what naga lays out.
 pub fn params_sizes() -> Vec<(&'static str, usize)> {
-    [blur::params_sizes(), data::params_sizes(), linear::params_sizes(), display::params_sizes()].concat()
+    [blur::params_sizes(), tiles::params_sizes(), data::params_sizes(), linear::params_sizes(), display::params_sizes()].concat()
 }
 
 /// Sizes of the Rust mirrors of the shaders' table entries as (shader, structure, bytes), likewise.

@@ -1,13 +1,13 @@
 //! K and Kᵀ entry by entry against explicit matrix rows, and the taps of a TSF against its poses.
 
 use crate::oracle::blur::{self, Matrix};
-use crate::support::gpu::{POISON, buffer, gpu, kernels, planes, poisoned, read, run};
+use crate::support::gpu::{POISON, buffer, gpu, kinds, planes, poisoned, read, run};
 use crate::support::{assert_close, f64s, noise};
 use glam::{DMat3, DVec2};
 use unshaken::gpu::Gpu;
-use unshaken::kernels::{Blur, BlurKernels, DeviceRgb, Scratch, ScratchSize, channels};
+use unshaken::kernels::{Blur, DeviceRgb, Kernels, Scratch, ScratchSize};
 use unshaken::pose::Pose;
-use unshaken::tsf::{INDISTINGUISHABLE, Interpolation, TapSet, Tsf};
+use unshaken::tsf::{INDISTINGUISHABLE, Interpolation, Tap, TapSet, Tsf};
 
 const ALL: [Interpolation; 3] = [Interpolation::Bilinear, Interpolation::Bicubic, Interpolation::SixPoint];
 const SIZES: [(usize, usize); 7] = [(1, 1), (1, 7), (7, 1), (17, 9), (33, 65), (67, 31), (300, 5)];
@@ -63,6 +63,7 @@ fn tolerance(taps: &TapSet, frame: (usize, usize), support: usize) -> f64 {
 
 struct Case {
     name: String,
+    kind: &'static (Gpu, Kernels),
     frame: (usize, usize),
     pad: usize,
     interpolation: Interpolation,
@@ -71,26 +72,34 @@ struct Case {
     tolerance: f64,
 }
 
+/// Rotate-then-shift, as scratch planes or by tiles.
+fn shifted(tsf: &Tsf, frame: (usize, usize), interpolation: Interpolation) -> TapSet {
+    TapSet::shifted(tsf, frame.0, frame.1, interpolation)
+}
+
+/// Every pose for itself.
+fn direct(tsf: &Tsf, frame: (usize, usize), _: Interpolation) -> TapSet {
+    TapSet::direct(tsf, frame.0, frame.1)
+}
+
 impl Case {
-    /// Rotate-then-shift.
-    fn new(name: &str, tsf: &Tsf, frame: (usize, usize), pad: usize, interpolation: Interpolation) -> Self {
-        Self::of_taps(name, TapSet::shifted(tsf, frame.0, frame.1, interpolation), frame, pad, interpolation)
-    }
-
-    /// Every pose for itself.
-    fn direct(name: &str, tsf: &Tsf, frame: (usize, usize), pad: usize, interpolation: Interpolation) -> Self {
-        Self::of_taps(&format!("direct, {name}"), TapSet::direct(tsf, frame.0, frame.1), frame, pad, interpolation)
-    }
-
-    fn of_taps(name: &str, taps: TapSet, frame: (usize, usize), pad: usize, interpolation: Interpolation) -> Self {
+    fn new(
+        name: &str,
+        kind: &'static (Gpu, Kernels),
+        taps: &TapSet,
+        frame: (usize, usize),
+        pad: usize,
+        interpolation: Interpolation,
+    ) -> Self {
         Self {
-            name: format!("{name}, {} x {} pixels, pad {pad}, {interpolation:?}", frame.0, frame.1),
+            name: format!("{name}, {} x {} pixels, pad {pad}, {interpolation:?}, software: {}", frame.0, frame.1, kind.0.software),
+            kind,
             frame,
             pad,
             interpolation,
-            matrix: blur::of_taps(&taps, interpolation, frame, pad),
-            blur: Blur::new(gpu(), kernels().blur(interpolation), &taps, frame, pad),
-            tolerance: tolerance(&taps, frame, interpolation.support()),
+            matrix: blur::of_taps(taps, interpolation, frame, pad),
+            blur: Blur::new(&kind.0, kind.1.blur(interpolation), taps, frame, pad),
+            tolerance: tolerance(taps, frame, interpolation.support()),
         }
     }
 
@@ -101,16 +110,16 @@ impl Case {
     /// [`Case::check`] of three channels at a time and of one.
     fn check_with(&self, size: ScratchSize) {
         for channels in [3, 1] {
-            self.check(&Scratch::new(gpu(), size, channels).expect("fits"));
+            self.check(&Scratch::new(&self.kind.0, size, channels).expect("fits"));
         }
     }
 
     fn forward(&self, scratch: &Scratch, latent: &DeviceRgb) -> [Vec<f32>; 3] {
         let m = self.counts().1;
         let out = [poisoned(m), poisoned(m), poisoned(m)];
-        let kernels = kernels().blur(self.interpolation);
+        let kernels = self.kind.1.blur(self.interpolation);
         for (latent, out) in latent.chunks(scratch.channels()).zip(out.chunks(scratch.channels())) {
-            run(&self.blur.forward(gpu(), kernels, scratch, latent, out));
+            run(&self.blur.forward(&self.kind.0, kernels, scratch, latent, out));
         }
         out.map(|o| read(&o, m))
     }
@@ -118,9 +127,9 @@ impl Case {
     /// `start + factor Kᵀ frame`.
     fn adjoint(&self, scratch: &Scratch, frame: &DeviceRgb, start: &[Vec<f32>; 3], factor: f32) -> [Vec<f32>; 3] {
         let out = planes(start);
-        let kernels = kernels().blur(self.interpolation);
+        let kernels = self.kind.1.blur(self.interpolation);
         for (frame, out) in frame.chunks(scratch.channels()).zip(out.chunks(scratch.channels())) {
-            run(&self.blur.adjoint(gpu(), kernels, scratch, frame, out, factor));
+            run(&self.blur.adjoint(&self.kind.0, kernels, scratch, frame, out, factor));
         }
         out.map(|o| read(&o, self.counts().0))
     }
@@ -165,10 +174,13 @@ fn check_all(interpolation: Interpolation) {
     for frame in SIZES {
         for (name, tsf) in motions(frame.0) {
             for pad in [0, 5] {
-                for case in [Case::new, Case::direct].map(|c| c(name, &tsf, frame, pad, interpolation)) {
-                    // More than the operator asks for: what lies beyond must not be read.
-                    let wanted = case.blur.scratch_wanted();
-                    case.check_with(ScratchSize { planes: wanted.planes + 1, copy: wanted.copy + 1 });
+                for (how, taps) in [("shifted", shifted as fn(&_, _, _) -> _), ("direct", direct)] {
+                    for kind in kinds() {
+                        let case = Case::new(&format!("{how}, {name}"), kind, &taps(&tsf, frame, interpolation), frame, pad, interpolation);
+                        // More than the operator asks for: what lies beyond must not be read.
+                        let wanted = case.blur.scratch_wanted();
+                        case.check_with(ScratchSize { planes: wanted.planes + 1, copy: wanted.copy + 1 });
+                    }
                 }
             }
         }
@@ -193,18 +205,25 @@ fn six_point_blur_and_adjoint_equal_the_matrix() {
 #[test]
 fn a_frame_six_thousand_pixels_wide_keeps_its_precision() {
     let poses = vec![Pose::planar(0.3, -0.2, 0.15, 0.6), Pose::planar(2.8, 0.4, 0.16, 0.4)];
-    for new in [Case::new, Case::direct] {
-        let case = new("wide", &Tsf::new(7000.0, poses.clone()).expect("valid"), (6001, 3), 12, Interpolation::Bicubic);
-        case.check_with(case.blur.scratch_wanted());
+    let (tsf, frame) = (Tsf::new(7000.0, poses).expect("valid"), (6001, 3));
+    for taps in [shifted, direct] {
+        for kind in kinds() {
+            let case = Case::new("wide", kind, &taps(&tsf, frame, Interpolation::Bicubic), frame, 12, Interpolation::Bicubic);
+            case.check_with(case.blur.scratch_wanted());
+        }
     }
 }
 
 #[test]
 fn several_passes_equal_one() {
+    let frame = (33, 21);
+    let [software, _] = kinds();
     for (name, tsf) in motions(33).into_iter().filter(|m| ["rotations", "pitch and yaw", "partly beyond the frame"].contains(&m.0)) {
-        let direct = Case::direct(name, &tsf, (33, 21), 4, Interpolation::Bicubic);
-        direct.check_with(direct.blur.scratch_needed());
-        let case = Case::new(name, &tsf, (33, 21), 4, Interpolation::Bicubic);
+        for kind in kinds() {
+            let direct = Case::new(name, kind, &direct(&tsf, frame, Interpolation::Bicubic), frame, 4, Interpolation::Bicubic);
+            direct.check_with(direct.blur.scratch_needed());
+        }
+        let case = Case::new(name, software, &shifted(&tsf, frame, Interpolation::Bicubic), frame, 4, Interpolation::Bicubic);
         let (least, wanted) = (case.blur.scratch_needed(), case.blur.scratch_wanted());
         assert!(wanted.planes > 3 * least.planes && wanted.copy > least.copy, "{name}: {wanted:?} {least:?}");
         for planes in [least.planes, least.planes + 1, 3 * least.planes, wanted.planes / 2, wanted.planes - 1] {
@@ -219,56 +238,49 @@ fn several_passes_equal_one() {
 #[test]
 fn more_base_warps_than_a_binding_holds_are_done_in_parts() {
     let pose = |i: i32| Pose::planar(0.3 * f64::from(i % 25), 0.3 * f64::from(i / 25), 0.02 * f64::from(i % 7), 1.0 / 600.0);
-    let tsf = Tsf::new(900.0, (0..600).map(pose).collect()).expect("valid");
-    assert!(TapSet::direct(&tsf, 17, 9).bases.len() > 512);
-    let case = Case::direct("600 poses", &tsf, (17, 9), 10, Interpolation::Bilinear);
-    case.check_with(case.blur.scratch_wanted());
+    let (tsf, frame) = (Tsf::new(900.0, (0..600).map(pose).collect()).expect("valid"), (17, 9));
+    let taps = TapSet::direct(&tsf, 17, 9);
+    assert!(taps.bases.len() > 512);
+    // The same with a shift, so that tiles do it.
+    let shifted = TapSet { bases: taps.bases.clone(), taps: taps.taps.iter().map(|t| Tap { dx: 1, ..t.clone() }).collect() };
+    for (kind, taps) in kinds().iter().flat_map(|k| [(k, &taps), (k, &shifted)]) {
+        let case = Case::new("600 poses", kind, taps, frame, 10, Interpolation::Bilinear);
+        case.check_with(case.blur.scratch_wanted());
+    }
+}
+
+/// Shifts that reach farther than workgroup memory does, and more of them than a table holds: parts of a base warp.
+#[test]
+fn tiles_split_long_paths() {
+    let (frame, pad) = ((67, 45), 30);
+    let bases: Vec<DMat3> = [-0.6, 0.5].map(|theta| Pose::planar(0.0, 0.0, theta, 1.0).rotation(90.0)).to_vec();
+    let long = (-28..=28).flat_map(|i| [(0, i, i / 3), (1, i / 2, -i)]);
+    let square = (-35..=35).flat_map(|x| (-35..=35).map(move |y| (0, x, y))).filter(|t| (t.1 * 7 + t.2 * 3) % 4 != 0);
+    let set = |shifts: Vec<(usize, i32, i32)>| {
+        let weight = |i: usize| (1.0 + 0.5 * (i as f64).sin()) / shifts.len() as f64;
+        let taps = shifts.iter().enumerate().map(|(i, &(base, dx, dy))| Tap { base, dx, dy, weight: weight(i) }).collect();
+        TapSet { bases: bases.clone(), taps }
+    };
+    let [_, gpu] = kinds();
+    for (name, taps) in [("long path", set(long.collect())), ("dense square", set(square.chain([(1, 3, 4)]).collect()))] {
+        let case = Case::new(name, gpu, &taps, frame, pad, Interpolation::Bicubic);
+        assert_eq!(case.blur.scratch_wanted(), ScratchSize::default(), "{name}: by tiles");
+        case.check_with(case.blur.scratch_wanted());
+    }
 }
 
 #[test]
 fn scratch_is_shared_without_traces() {
-    let scratch = Scratch::new(gpu(), ScratchSize { planes: 40 * 60 * 110, copy: 300 * 200 }, 3).expect("fits");
-    for round in 0..2 {
-        for (name, tsf) in motions(33).iter().take(7) {
-            let case = Case::new(&format!("round {round}, {name}"), tsf, (33, 21), 4, Interpolation::Bicubic);
-            let loud = [1.0f32, 2.0, 3.0].map(|v| vec![v * POISON; case.counts().0]);
-            case.forward(&scratch, &with_more(&loud));
-            case.check(&scratch);
-        }
-    }
-}
-
-/// Scratch is read as a storage texture by software rasterisers and as a sampled one on GPUs; here both ways on one adapter.
-#[test]
-fn scratch_reads_the_same_as_either_kind_of_texture() {
-    let (frame, pad) = ((67, 31), 5);
-    let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
-    let gpus = [true, false].map(|software| {
-        let mut gpu = Gpu::new().expect("an adapter");
-        gpu.software = software;
-        gpu
-    });
-    let blurred = |gpu: &Gpu, interpolation: Interpolation, tsf: &Tsf| {
-        let kernels = BlurKernels::new(interpolation);
-        let mut all = Vec::new();
-        for taps in [TapSet::shifted(tsf, frame.0, frame.1, interpolation), TapSet::direct(tsf, frame.0, frame.1)] {
-            let blur = Blur::new(gpu, &kernels, &taps, frame, pad);
-            let scratch = Scratch::new(gpu, blur.scratch_wanted(), 3).expect("fits");
-            let latent = [1u64, 2, 3].map(|seed| gpu.upload("latent", &noise(seed, n)).expect("fits"));
-            let (out, back) = (channels(gpu, "frame", m).expect("fits"), channels(gpu, "back", n).expect("fits"));
-            gpu.submit(&blur.forward(gpu, &kernels, &scratch, &latent, &out));
-            gpu.submit(&blur.adjoint(gpu, &kernels, &scratch, &out, &back, 1.0));
-            all.extend(out.iter().flat_map(|b| unshaken::gpu::read(gpu, b, m).expect("the device answers")));
-            all.extend(back.iter().flat_map(|b| unshaken::gpu::read(gpu, b, n).expect("the device answers")));
-        }
-        all
-    };
-    for (name, tsf) in motions(frame.0).into_iter().filter(|m| ["rotations", "large rotation"].contains(&m.0)) {
-        for interpolation in ALL {
-            let [storage, sampled] = gpus.each_ref().map(|gpu| blurred(gpu, interpolation, &tsf));
-            assert!(storage.iter().any(|v| v.abs() > 0.1), "{name}: nothing was computed");
-            let worst = storage.iter().zip(&sampled).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(worst < 1e-5, "{name}, {interpolation:?}: they differ by {worst}");
+    for kind in kinds() {
+        let scratch = Scratch::new(&kind.0, ScratchSize { planes: 40 * 60 * 110, copy: 300 * 200 }, 3).expect("fits");
+        for round in 0..2 {
+            for (name, tsf) in motions(33).iter().take(7) {
+                let taps = shifted(tsf, (33, 21), Interpolation::Bicubic);
+                let case = Case::new(&format!("round {round}, {name}"), kind, &taps, (33, 21), 4, Interpolation::Bicubic);
+                let loud = [1.0f32, 2.0, 3.0].map(|v| vec![v * POISON; case.counts().0]);
+                case.forward(&scratch, &with_more(&loud));
+                case.check(&scratch);
+            }
         }
     }
 }
@@ -487,16 +499,21 @@ fn the_rough_blur_costs_less_and_is_about_the_same() {
 /// K and Kᵀ of every band on a device whose bindings hold less than a plane.
 #[test]
 fn planes_larger_than_a_binding_are_bound_in_bands() {
-    let gpu = unshaken::gpu::Gpu::new().expect("an adapter").with_binding_limit(96 * 1024);
-    let kernels = unshaken::kernels::Kernels::new(&gpu);
+    for software in [true, false] {
+        check_bands(&gpu().treated_as(software).with_binding_limit(96 * 1024));
+    }
+}
+
+fn check_bands(gpu: &Gpu) {
+    let kernels = Kernels::new(gpu);
     let (frame, pad) = ((120, 500), 8);
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
     assert!(m > gpu.max_binding());
     let tsf = Tsf::new(500.0, vec![Pose::planar(0.4, -0.3, -0.4, 0.6), Pose::planar(2.2, 3.8, 0.5, 0.4)]).expect("valid");
     for taps in [TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear), TapSet::direct(&tsf, frame.0, frame.1)] {
-        let blur = Blur::new(&gpu, kernels.blur(Interpolation::Bilinear), &taps, frame, pad);
-        let most = ScratchSize { planes: gpu.max_binding(), copy: gpu.max_binding() };
-        let scratch = Scratch::new(&gpu, blur.scratch_wanted().min(most), 3).expect("fits");
+        let blur = Blur::new(gpu, kernels.blur(Interpolation::Bilinear), &taps, frame, pad);
+        let most = ScratchSize { planes: gpu.max_texels(), copy: gpu.max_texels() };
+        let scratch = Scratch::new(gpu, blur.scratch_wanted().min(most), 3).expect("fits");
         let upload = |seed: u64, count: usize| -> ([Vec<f32>; 3], DeviceRgb) {
             let values = [noise(seed, count), noise(seed + 1, count), noise(seed + 2, count)];
             let buffers = values.each_ref().map(|v| gpu.upload("test", v).expect("fits"));
@@ -504,14 +521,14 @@ fn planes_larger_than_a_binding_are_bound_in_bands() {
         };
         let ((latent, e), (seen, b)) = (upload(1, n), upload(4, m));
         let ((_, out), (start, back)) = (upload(7, m), upload(10, n));
-        gpu.submit(&blur.forward(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &e, &out));
-        gpu.submit(&blur.adjoint(&gpu, kernels.blur(Interpolation::Bilinear), &scratch, &b, &back, 1.0));
+        gpu.submit(&blur.forward(gpu, kernels.blur(Interpolation::Bilinear), &scratch, &e, &out));
+        gpu.submit(&blur.adjoint(gpu, kernels.blur(Interpolation::Bilinear), &scratch, &b, &back, 1.0));
         let matrix = blur::of_taps(&taps, Interpolation::Bilinear, frame, pad);
         let bound = tolerance(&taps, frame, 1);
         for c in 0..3 {
-            let got = unshaken::gpu::read(&gpu, &out[c], m).expect("the device answers");
+            let got = unshaken::gpu::read(gpu, &out[c], m).expect("the device answers");
             assert_close("K in bands", &got, &matrix.apply(&f64s(&latent[c])), |_| bound);
-            let got = unshaken::gpu::read(&gpu, &back[c], n).expect("the device answers");
+            let got = unshaken::gpu::read(gpu, &back[c], n).expect("the device answers");
             let expected = matrix.transposed(&f64s(&seen[c]));
             let expected: Vec<f64> = expected.iter().zip(&start[c]).map(|(e, &s)| e + f64::from(s)).collect();
             assert_close("Kᵀ in bands", &got, &expected, |_| 2.0 * bound + 2e-7);
@@ -525,15 +542,16 @@ fn a_frame_twelve_thousand_pixels_wide_runs_in_one_piece_and_in_bands() {
     let (n, m) = ((frame.0 + 2 * pad) * (frame.1 + 2 * pad), frame.0 * frame.1);
     let tsf = Tsf::new(9000.0, vec![Pose::planar(0.3, -0.2, 0.02, 0.5), Pose::planar(2.3, 3.4, 0.0, 0.5)]).expect("valid");
     let taps = TapSet::shifted(&tsf, frame.0, frame.1, Interpolation::Bilinear);
-    let kernels = kernels().blur(Interpolation::Bilinear);
-    let blur = Blur::new(gpu(), kernels, &taps, frame, pad);
+    let [(gpu, kernels), (fast, others)] = kinds();
+    let kernels = kernels.blur(Interpolation::Bilinear);
+    let blur = Blur::new(gpu, kernels, &taps, frame, pad);
     let (latent, seen) = (planes(&[1, 2, 3].map(|s| noise(s, n))), planes(&[4, 5, 6].map(|s| noise(s, m))));
     let (least, wanted) = (blur.scratch_needed(), blur.scratch_wanted());
     let results = [wanted, ScratchSize { planes: wanted.planes / 7, copy: (wanted.copy / 2).max(least.copy) }].map(|size| {
-        let scratch = Scratch::new(gpu(), size, 3).expect("fits");
+        let scratch = Scratch::new(gpu, size, 3).expect("fits");
         let (out, back) = ([poisoned(m), poisoned(m), poisoned(m)], planes(&[7, 8, 9].map(|s| noise(s, n))));
         let (forward, adjoint) =
-            (blur.forward(gpu(), kernels, &scratch, &latent, &out), blur.adjoint(gpu(), kernels, &scratch, &seen, &back, 1.0));
+            (blur.forward(gpu, kernels, &scratch, &latent, &out), blur.adjoint(gpu, kernels, &scratch, &seen, &back, 1.0));
         let steps = forward.len() + adjoint.len();
         run(&forward);
         run(&adjoint);
@@ -545,4 +563,13 @@ fn a_frame_twelve_thousand_pixels_wide_runs_in_one_piece_and_in_bands() {
     assert!(far(&k, &k_bands) < 1e-5 && far(&t, &t_bands) < 1e-5, "{} {}", far(&k, &k_bands), far(&t, &t_bands));
     // No pixel was left out: K of noise is nowhere what the buffer held, and Kᵀ moved the start.
     assert!(k.iter().all(|v| v.abs() < 2.0) && t.iter().all(|v| v.is_finite()));
+    // As tiles, which compute in another order.
+    let kernels = others.blur(Interpolation::Bilinear);
+    let blur = Blur::new(fast, kernels, &taps, frame, pad);
+    let scratch = Scratch::new(fast, blur.scratch_wanted(), 3).expect("fits");
+    let (out, back) = ([poisoned(m), poisoned(m), poisoned(m)], planes(&[7, 8, 9].map(|s| noise(s, n))));
+    run(&blur.forward(fast, kernels, &scratch, &latent, &out));
+    run(&blur.adjoint(fast, kernels, &scratch, &seen, &back, 1.0));
+    let (k_tiles, t_tiles) = (read(&out[1], m), read(&back[1], n));
+    assert!(far(&k, &k_tiles) < 1e-5 && far(&t, &t_tiles) < 1e-5, "{} {}", far(&k, &k_tiles), far(&t, &t_tiles));
 }

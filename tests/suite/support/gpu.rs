@@ -19,6 +19,18 @@ pub fn kernels() -> &'static Kernels {
     KERNELS.get_or_init(|| Kernels::new(gpu()))
 }
 
+/// The device, and the kernels, as a software rasteriser's and as a GPU's: designs and kinds of scratch that only one of them would use.
+pub fn kinds() -> &'static [(Gpu, Kernels); 2] {
+    static KINDS: OnceLock<[(Gpu, Kernels); 2]> = OnceLock::new();
+    KINDS.get_or_init(|| {
+        [true, false].map(|software| {
+            let gpu = gpu().treated_as(software);
+            let kernels = Kernels::new(&gpu);
+            (gpu, kernels)
+        })
+    })
+}
+
 /// A buffer that holds `values`.
 pub fn buffer(values: &[f32]) -> wgpu::Buffer {
     gpu().upload("test", values).expect("finite values that fit")

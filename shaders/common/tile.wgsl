@@ -1,0 +1,68 @@
+// The design for GPUs: K and its adjoint a tile at a time. What a base warp holds of the tile stands in workgroup memory, and the sums of
+// its shifts are formed in registers, so that nothing but input and output touches device memory.
+//
+// An invocation makes TALL pixels of a column. `table` starts with two entries for every group of shifts that share a base warp: the
+// corner of what they read, relative to the tile, and its size; then first and last entry of the shifts, the base, and whether the base's
+// shifts end with this group. Entries of shifts are those of taps.wgsl; `place` is relative to the corner.
+// Channels that the operator works on at a time: 3, or only the first.
+override CHANNELS: u32 = 3u;
+// Pixels that workgroup memory holds.
+override HELD: u32 = 1365u;
+const SIDE: i32 = 32;
+const TALL: i32 = 8;
+const LANES: i32 = 128;
+
+@group(0) @binding(1) var<uniform> bases: array<Base, 512>;
+@group(0) @binding(2) var<uniform> table: array<vec4i, 4096>;
+
+var<workgroup> held_r: array<f32, HELD>;
+var<workgroup> held_g: array<f32, HELD>;
+var<workgroup> held_b: array<f32, HELD>;
+
+fn held(i: i32) -> vec3f {
+    if CHANNELS > 1u {
+        return vec3f(held_r[i], held_g[i], held_b[i]);
+    }
+    return vec3f(held_r[i], 0.0, 0.0);
+}
+
+fn hold(i: i32, value: vec3f) {
+    held_r[i] = value.x;
+    if CHANNELS > 1u {
+        held_g[i] = value.y;
+        held_b[i] = value.z;
+    }
+}
+
+// Pixel i of an image of `width`: without a division of integers, which costs dozens of instructions.
+fn place(i: i32, width: i32, reciprocal: f32) -> vec2i {
+    let y = i32((f32(i) + 0.5) * reciprocal);
+    return vec2i(i - y * width, y);
+}
+
+// Consecutive pixels of a column.
+struct Column {
+    a: mat4x3f,
+    b: mat4x3f,
+}
+
+fn four(row: i32, i: i32) -> mat4x3f {
+    return mat4x3f(held(i), held(i + row), held(i + 2 * row), held(i + 3 * row));
+}
+
+// Adds the shifts `first` to `last` - 1 of what is held, in rows of `row`, for the pixels from index `start` on.
+fn shifts(column: Column, start: i32, row: i32, first: i32, last: i32) -> Column {
+    var sum = column;
+    for (var k = first; k < last; k += 1) {
+        let run = table[k];
+        let i = start + run.x;
+        let a = four(row, i);
+        let b = four(row, i + 4 * row);
+        let c = held(i + TALL * row);
+        let d = held(i + (TALL + 1) * row);
+        let w = bitcast<vec3f>(run.yzw);
+        sum.a += w.x * a + w.y * mat4x3f(a[1], a[2], a[3], b[0]) + w.z * mat4x3f(a[2], a[3], b[0], b[1]);
+        sum.b += w.x * b + w.y * mat4x3f(b[1], b[2], b[3], c) + w.z * mat4x3f(b[2], b[3], c, d);
+    }
+    return sum;
+}
