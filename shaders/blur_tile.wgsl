@@ -126,11 +126,11 @@ fn keep(o: i32, left: i32, pixels: mat4x3f) {
     }
 }
 
-@compute @workgroup_size(32, 4)
+@compute @workgroup_size(32, 8)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3u) {
     let corner = vec2i(group.xy) * SIDE + vec2i(0, params.rows.x); // frame pixel of the tile's first
     let mine = vec2i(i32(id.x), i32(id.y) * TALL);
-    var sum = Column();
+    var sum = mat4x3f();
     for (var g = 0; g < params.groups; g += 1) {
         let box = table[2 * g];
         let run = table[2 * g + 1];
@@ -148,7 +148,6 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
     let p = corner + mine;
     if p.x < params.out_size.x {
         let o = (p.y - params.out_first) * params.out_size.x + p.x;
-        keep(o, params.rows.y - p.y, sum.a);
-        keep(o + 4 * params.out_size.x, params.rows.y - p.y - 4, sum.b);
+        keep(o, params.rows.y - p.y, sum);
     }
 }

@@ -1,7 +1,7 @@
 // Exact adjoint of K for a tile of the latent grid: per base warp, the shifted sums of the frame where the warp's targets of the tile lie,
 // 32 by 32 pixels, then latent(p) += factor * sum over targets q of sums(q) k(u) k(v), where (u, v) is the source position of q less p,
-// computed by the same expression as forward. A gather, so no atomics and one result always. For warps that turn and stretch little: the
-// targets of a pixel then lie in a window of 2 SUPPORT + 1 pixels; see Blur::near for "little".
+// computed as forward does. A gather, so no atomics and one result always. For warps that turn and stretch little: the targets of four
+// pixels of a column then lie in windows of 2 SUPPORT + 1 pixels, each a row below the one before; see Blur::near for "little".
 override SUPPORT: i32 = 2;
 
 struct Params {
@@ -30,61 +30,106 @@ struct Params {
 
 // The frame, 0 beyond it.
 fn pixel(q: vec2i) -> vec3f {
-    var value = vec3f(0.0);
-    if q.x >= 0 && q.x < params.in_size.x && q.y >= params.in_rows.x && q.y < params.in_rows.y {
-        let i = (q.y - params.in_first) * params.in_size.x + q.x;
-        value.x = in_r[i];
-        if CHANNELS > 1u {
-            value.y = in_g[i];
-            value.z = in_b[i];
-        }
+    let near = clamp(q, vec2i(0, params.in_rows.x), vec2i(params.in_size.x, params.in_rows.y) - 1);
+    let i = (near.y - params.in_first) * params.in_size.x + near.x;
+    var value = vec3f(in_r[i], 0.0, 0.0);
+    if CHANNELS > 1u {
+        value.y = in_g[i];
+        value.z = in_b[i];
     }
-    return value;
+    return select(vec3f(0.0), value, all(near == q));
 }
 
 fn towards(base: Base, p: vec2f) -> vec2f {
     return clamp(displacement(base.abc_inverse, base.def_inverse, p), vec2f(-1e6), vec2f(1e6));
 }
 
-// What the held pixel i, whose source position is u from the upper of two pixels of a column, gives to either.
-fn share(u: vec2f, i: i32) -> mat2x3f {
-    let value = interpolation(u.x) * held(i);
-    return mat2x3f(interpolation(u.y) * value, interpolation(u.y + 1.0) * value);
+// Pixels of a row of the window, each with its horizontal weight; w is how far below its source position the topmost pixel lies.
+struct Row {
+    a: vec4f,
+    b: vec4f,
+    c: vec4f,
+    d: vec4f,
+    e: vec4f,
+    f: vec4f,
+    g: vec4f,
 }
 
-// The sums for frame pixel p and the one below it; `region` is the frame pixel of held pixel 0.
-fn gather(base: Base, p: vec2i, region: vec2i) -> mat2x3f {
-    let to = towards(base, vec2f(p) + vec2f(0.0, 0.5) - params.centre);
-    let window = vec2i(2 * SUPPORT + 1, 2 * SUPPORT + 2);
-    // Targets of a pixel of the tile lie in the region: where the window reaches beyond, it may as well begin later.
-    let first = clamp(p + vec2i(round(to)) - SUPPORT - region, vec2i(0), SIDE - window);
-    let q = region + first;
-    var sum = mat2x3f();
-    var i = first.y * SIDE + first.x;
-    var at = vec2f(q) - params.centre;
-    var u = vec2f(p - q);
+// The held pixel i, whose source position is u from the topmost pixel.
+fn weighted(u: vec2f, i: i32) -> vec4f {
+    return vec4f(interpolation(u.x) * held(i), u.y);
+}
+
+// The row that begins with held pixel i, frame pixel `at` (centred); u is without the displacement there.
+fn weighted_row(base: Base, at: vec2f, u: vec2f, i: i32) -> Row {
+    let d = displacement(base.abc, base.def, at);
+    var row = Row();
     if PLANAR {
         // The displacement changes by as much from pixel to pixel everywhere.
         let x = vec2f(1.0 + base.abc.x, base.def.x);
-        let y = vec2f(base.abc.y, 1.0 + base.def.y);
-        u -= displacement(base.abc, base.def, at);
-        for (var row = 0; row < window.y; row += 1) {
-            sum += share(u, i) + share(u - x, i + 1) + share(u - 2.0 * x, i + 2);
-            if SUPPORT > 1 {
-                sum += share(u - 3.0 * x, i + 3) + share(u - 4.0 * x, i + 4);
-            }
-            if SUPPORT > 2 {
-                sum += share(u - 5.0 * x, i + 5) + share(u - 6.0 * x, i + 6);
-            }
-            u -= y;
-            i += SIDE;
+        row.a = weighted(u - d, i);
+        row.b = weighted(u - d - x, i + 1);
+        row.c = weighted(u - d - 2.0 * x, i + 2);
+        if SUPPORT > 1 {
+            row.d = weighted(u - d - 3.0 * x, i + 3);
+            row.e = weighted(u - d - 4.0 * x, i + 4);
         }
-        return sum;
+        if SUPPORT > 2 {
+            row.f = weighted(u - d - 5.0 * x, i + 5);
+            row.g = weighted(u - d - 6.0 * x, i + 6);
+        }
+        return row;
     }
-    for (var row = 0; row < window.y; row += 1) {
-        for (var x = 0; x < window.x; x += 1) {
-            let step = vec2f(f32(x), 0.0);
-            sum += share(u - step - displacement(base.abc, base.def, at + step), i + x);
+    let x = vec2f(1.0, 0.0);
+    row.a = weighted(u - d, i);
+    row.b = weighted(u - x - displacement(base.abc, base.def, at + x), i + 1);
+    row.c = weighted(u - 2.0 * x - displacement(base.abc, base.def, at + 2.0 * x), i + 2);
+    if SUPPORT > 1 {
+        row.d = weighted(u - 3.0 * x - displacement(base.abc, base.def, at + 3.0 * x), i + 3);
+        row.e = weighted(u - 4.0 * x - displacement(base.abc, base.def, at + 4.0 * x), i + 4);
+    }
+    if SUPPORT > 2 {
+        row.f = weighted(u - 5.0 * x - displacement(base.abc, base.def, at + 5.0 * x), i + 5);
+        row.g = weighted(u - 6.0 * x - displacement(base.abc, base.def, at + 6.0 * x), i + 6);
+    }
+    return row;
+}
+
+// What a row gives to the pixel `below` the topmost.
+fn share(row: Row, below: f32) -> vec3f {
+    var sum = interpolation(row.a.w + below) * row.a.xyz + interpolation(row.b.w + below) * row.b.xyz + interpolation(row.c.w + below) * row.c.xyz;
+    if SUPPORT > 1 {
+        sum += interpolation(row.d.w + below) * row.d.xyz + interpolation(row.e.w + below) * row.e.xyz;
+    }
+    if SUPPORT > 2 {
+        sum += interpolation(row.f.w + below) * row.f.xyz + interpolation(row.g.w + below) * row.g.xyz;
+    }
+    return sum;
+}
+
+// Adds to the sums for frame pixel p and the three below it; `region` is the frame pixel of held pixel 0. Each pixel has a window of its
+// own, as wide as high. What of it lies beyond the region is no target of the tile: it weighs nothing, whatever is read for it.
+fn gather(base: Base, p: vec2i, region: vec2i, before: mat4x3f) -> mat4x3f {
+    let to = towards(base, vec2f(p) + vec2f(0.0, 1.5) - params.centre);
+    let first = p + vec2i(round(to)) - SUPPORT - region;
+    let q = region + first;
+    var sum = before;
+    var i = first.y * SIDE + first.x;
+    var at = vec2f(q) - params.centre;
+    var u = vec2f(p - q);
+    for (var y = 0; y < 2 * SUPPORT + TALL; y += 1) {
+        let row = weighted_row(base, at, u, i);
+        if y <= 2 * SUPPORT {
+            sum[0] += share(row, 0.0);
+        }
+        if y >= 1 && y <= 2 * SUPPORT + 1 {
+            sum[1] += share(row, 1.0);
+        }
+        if y >= 2 && y <= 2 * SUPPORT + 2 {
+            sum[2] += share(row, 2.0);
+        }
+        if y >= 3 {
+            sum[3] += share(row, 3.0);
         }
         u.y -= 1.0;
         at.y += 1.0;
@@ -93,20 +138,7 @@ fn gather(base: Base, p: vec2i, region: vec2i) -> mat2x3f {
     return sum;
 }
 
-// Adds what lies in the tile, `left` rows of it, and in the latent grid.
-fn add(p: vec2i, left: i32, pair: mat2x3f) {
-    if p.x < params.out_size.x {
-        let o = (p.y - params.out_first) * params.out_size.x + p.x;
-        if left > 0 && p.y < params.rows.y {
-            add_one(o, pair[0]);
-        }
-        if left > 1 && p.y + 1 < params.rows.y {
-            add_one(o + params.out_size.x, pair[1]);
-        }
-    }
-}
-
-fn add_one(o: i32, value: vec3f) {
+fn add(o: i32, value: vec3f) {
     latent_r[o] += params.factor * value.x;
     if CHANNELS > 1u {
         latent_g[o] += params.factor * value.y;
@@ -114,27 +146,15 @@ fn add_one(o: i32, value: vec3f) {
     }
 }
 
-// Written out, as an index that varies would keep the sums in memory.
-fn hold_four(i: i32, pixels: mat4x3f) {
-    hold(i, pixels[0]);
-    hold(i + SIDE, pixels[1]);
-    hold(i + 2 * SIDE, pixels[2]);
-    hold(i + 3 * SIDE, pixels[3]);
-}
-
-@compute @workgroup_size(32, 4)
+@compute @workgroup_size(32, 8)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3u) {
     let side = params.side;
     let corner = vec2i(group.xy) * side + vec2i(0, params.rows.x); // latent pixel of the tile's first
     let mine = vec2i(i32(id.x), i32(id.y) * TALL);
     let middle = vec2f(f32(side - 1) / 2.0);
     let source = corner - params.pad; // in frame pixels
-    var sum = Column();
-    // Of pairs of pixels.
-    var a = mat2x3f();
-    var b = mat2x3f();
-    var c = mat2x3f();
-    var d = mat2x3f();
+    var sum = mat4x3f();
+    var gathered = mat4x3f();
     for (var g = 0; g < params.groups; g += 1) {
         let box = table[2 * g];
         let run = table[2 * g + 1];
@@ -152,31 +172,33 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
         if run.w != 0 {
             workgroupBarrier();
             let i = mine.y * SIDE + mine.x;
-            hold_four(i, sum.a);
-            hold_four(i + 4 * SIDE, sum.b);
-            sum = Column();
+            hold(i, sum[0]);
+            hold(i + SIDE, sum[1]);
+            hold(i + 2 * SIDE, sum[2]);
+            hold(i + 3 * SIDE, sum[3]);
+            sum = mat4x3f();
             workgroupBarrier();
-            if mine.x < side {
-                if mine.y < side {
-                    a += gather(base, source + mine, region);
-                }
-                if mine.y + 2 < side {
-                    b += gather(base, source + mine + vec2i(0, 2), region);
-                }
-                if mine.y + 4 < side {
-                    c += gather(base, source + mine + vec2i(0, 4), region);
-                }
-                if mine.y + 6 < side {
-                    d += gather(base, source + mine + vec2i(0, 6), region);
-                }
+            if mine.x < side && mine.y < side {
+                gathered = gather(base, source + mine, region, gathered);
             }
         }
     }
-    if mine.x < side {
-        let p = corner + mine;
-        add(p, side - mine.y, a);
-        add(p + vec2i(0, 2), side - mine.y - 2, b);
-        add(p + vec2i(0, 4), side - mine.y - 4, c);
-        add(p + vec2i(0, 6), side - mine.y - 6, d);
+    let p = corner + mine;
+    let left = min(side - mine.y, params.rows.y - p.y);
+    if mine.x < side && p.x < params.out_size.x {
+        let row = params.out_size.x;
+        let o = (p.y - params.out_first) * row + p.x;
+        if left > 0 {
+            add(o, gathered[0]);
+        }
+        if left > 1 {
+            add(o + row, gathered[1]);
+        }
+        if left > 2 {
+            add(o + 2 * row, gathered[2]);
+        }
+        if left > 3 {
+            add(o + 3 * row, gathered[3]);
+        }
     }
 }

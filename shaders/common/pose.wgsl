@@ -26,32 +26,34 @@ fn displacement(abc: vec4f, def: vec4f, p: vec2f) -> vec2f {
 
 // Interpolation weight at distance x. SUPPORT 1: linear; 2: cubic convolution (Keys 1981, a = -1/2); 3: Keys' six-point
 // cubic convolution of fourth order. SUPPORT is an `override` of the including kernel.
+//
+// The pieces of the cubics as sums: below 1 both terms (or all three) count, beyond only those whose base is not 0. A choice between the
+// pieces would compute all of them in full.
 fn interpolation(x: f32) -> f32 {
     let t = abs(x);
+    let w = max(1.0 - t, 0.0);
     if SUPPORT == 1 {
-        return max(1.0 - t, 0.0);
+        return w;
     }
+    let v = max(2.0 - t, 0.0);
     if SUPPORT == 2 {
-        let inner = (1.5 * t - 2.5) * t * t + 1.0;
-        let outer = ((-0.5 * t + 2.5) * t - 4.0) * t + 2.0;
-        return select(select(outer, 0.0, t >= 2.0), inner, t < 1.0);
+        return v * v * (0.5 * v - 0.5) + w * w * (1.0 - 2.0 * w);
     }
-    let inner = (4.0 / 3.0 * t - 7.0 / 3.0) * t * t + 1.0;
-    let middle = ((-7.0 / 12.0 * t + 3.0) * t - 59.0 / 12.0) * t + 2.5;
-    let outer = ((1.0 / 12.0 * t - 2.0 / 3.0) * t + 1.75) * t - 1.5;
-    return select(select(select(outer, 0.0, t >= 3.0), middle, t < 2.0), inner, t < 1.0);
+    let u = max(3.0 - t, 0.0);
+    return u * u * (1.0 / 12.0 - u / 12.0) + v * v * (2.0 / 3.0 * v - 1.0 / 3.0) + w * w * (5.0 / 12.0 - 23.0 / 12.0 * w);
 }
 
 // `interpolation` of four distances.
 fn interpolation4(x: vec4f) -> vec4f {
     let t = abs(x);
+    let w = max(1.0 - t, vec4f(0.0));
     if SUPPORT == 1 {
-        return max(1.0 - t, vec4f(0.0));
+        return w;
     }
+    let v = max(2.0 - t, vec4f(0.0));
     if SUPPORT == 2 {
-        let inner = (1.5 * t - 2.5) * t * t + 1.0;
-        let outer = ((-0.5 * t + 2.5) * t - 4.0) * t + 2.0;
-        return select(select(outer, vec4f(0.0), t >= vec4f(2.0)), inner, t < vec4f(1.0));
+        return v * v * (0.5 * v - 0.5) + w * w * (1.0 - 2.0 * w);
     }
-    return vec4f(interpolation(x.x), interpolation(x.y), interpolation(x.z), interpolation(x.w));
+    let u = max(3.0 - t, vec4f(0.0));
+    return u * u * (1.0 / 12.0 - u / 12.0) + v * v * (2.0 / 3.0 * v - 1.0 / 3.0) + w * w * (5.0 / 12.0 - 23.0 / 12.0 * w);
 }

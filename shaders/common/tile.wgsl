@@ -9,8 +9,8 @@ override CHANNELS: u32 = 3u;
 // Pixels that workgroup memory holds.
 override HELD: u32 = 1365u;
 const SIDE: i32 = 32;
-const TALL: i32 = 8;
-const LANES: i32 = 128;
+const TALL: i32 = 4;
+const LANES: i32 = 256;
 
 @group(0) @binding(1) var<uniform> bases: array<Base, 512>;
 @group(0) @binding(2) var<uniform> table: array<vec4i, 4096>;
@@ -40,29 +40,22 @@ fn place(i: i32, width: i32, reciprocal: f32) -> vec2i {
     return vec2i(i - y * width, y);
 }
 
-// Consecutive pixels of a column.
-struct Column {
-    a: mat4x3f,
-    b: mat4x3f,
-}
-
-fn four(row: i32, i: i32) -> mat4x3f {
-    return mat4x3f(held(i), held(i + row), held(i + 2 * row), held(i + 3 * row));
-}
-
-// Adds the shifts `first` to `last` - 1 of what is held, in rows of `row`, for the pixels from index `start` on.
-fn shifts(column: Column, start: i32, row: i32, first: i32, last: i32) -> Column {
-    var sum = column;
+// Adds the shifts `first` to `last` - 1 of what is held, in rows of `row`, to the TALL pixels from index `start` on.
+fn shifts(pixels: mat4x3f, start: i32, row: i32, first: i32, last: i32) -> mat4x3f {
+    var sum = pixels;
     for (var k = first; k < last; k += 1) {
         let run = table[k];
         let i = start + run.x;
-        let a = four(row, i);
-        let b = four(row, i + 4 * row);
-        let c = held(i + TALL * row);
-        let d = held(i + (TALL + 1) * row);
         let w = bitcast<vec3f>(run.yzw);
-        sum.a += w.x * a + w.y * mat4x3f(a[1], a[2], a[3], b[0]) + w.z * mat4x3f(a[2], a[3], b[0], b[1]);
-        sum.b += w.x * b + w.y * mat4x3f(b[1], b[2], b[3], c) + w.z * mat4x3f(b[2], b[3], c, d);
+        let a = mat4x3f(held(i), held(i + row), held(i + 2 * row), held(i + 3 * row));
+        sum += w.x * a;
+        // No shift follows this one: the same for all invocations.
+        if run.z == 0 {
+            continue;
+        }
+        let b = held(i + 4 * row);
+        let c = held(i + 5 * row);
+        sum += w.y * mat4x3f(a[1], a[2], a[3], b) + w.z * mat4x3f(a[2], a[3], b, c);
     }
     return sum;
 }

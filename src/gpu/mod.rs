@@ -86,8 +86,8 @@ pub struct Rows<'a> {
 
 /// Pixels per row of a texture that holds an array; shaders/common/texels.wgsl shifts by its logarithm.
 const TEXEL_ROW: usize = 4096;
-/// Workgroup memory that is asked for: more than 32 KiB few adapters have, and fewer workgroups then run beside each other.
-const WORKGROUP_BYTES: u32 = 32 << 10;
+/// Workgroup memory that is asked for: with more, fewer workgroups run beside each other (src/kernels/tiles.rs).
+const WORKGROUP_BYTES: u32 = 24 << 10;
 /// Rows at whose multiples a part of an image may begin: 64 rows of `f32` are a multiple of 256 bytes whatever their length, the
 /// alignment that every adapter accepts.
 const ROW_STEP: usize = 64;

@@ -10,7 +10,7 @@
 //! frame from the scratch rows that its shifts reach; Kᵀ adds to the latent grid what a band of scratch rows holds. What either reads is
 //! copied with a margin of zeros first.
 
-use super::tiles::{TileKernels, Tiles};
+use super::tiles::{HELD, TileKernels, Tiles};
 use crate::error::Result;
 use crate::gpu::{Gpu, Kernel, Step, Texels};
 use crate::tsf::{Interpolation, TapSet};
@@ -123,8 +123,8 @@ pub struct BlurKernels {
     pub(super) support: usize,
     /// For one channel and for three.
     compiled: [OnceLock<Compiled>; 2],
-    /// For one channel and for three, each for any base warps and for those that do not foreshorten.
-    pub(super) tiles: [[OnceLock<TileKernels>; 2]; 2],
+    /// For one channel and for three, each for any base warps and for those that do not foreshorten, by the workgroup memory they take.
+    pub(super) tiles: [[[OnceLock<TileKernels>; HELD.len()]; 2]; 2],
 }
 
 struct Compiled {
@@ -180,17 +180,20 @@ fn displacement_table(h: &DMat3) -> ([f32; 4], [f32; 4]) {
 }
 
 /// Over a frame's corners and centre: the largest absolute row sum of the Jacobian of `h` (how far a unit square spreads), and the largest
-/// change of the displacement `h p - p` over half a tile of shaders/warp_adjoint_near.wgsl.
+/// change of the displacement `h p - p` from the middle of the pixels that one invocation of an adjoint makes to any of them.
 fn spread(h: &DMat3, half: DVec2) -> (f64, f64) {
     let (mut worst, mut drift) = (0.0f64, 0.0f64);
-    let tile = DVec2::new(NEAR.0 as f64 - 1.0, NEAR.1 as f64 - 1.0) / 2.0;
+    // What one invocation makes there, and of shaders/blur_tile_adjoint.wgsl.
+    let halves = [DVec2::new(NEAR.0 as f64 - 1.0, NEAR.1 as f64 - 1.0) / 2.0, DVec2::new(0.0, 1.5)];
     for s in [DVec2::ZERO, DVec2::new(1.0, 1.0), DVec2::new(-1.0, 1.0), DVec2::new(1.0, -1.0), DVec2::new(-1.0, -1.0)] {
         let p = s * half;
         let (a, e) = (crate::pose::project(h, p), 0.5);
         let dx = (crate::pose::project(h, p + DVec2::new(e, 0.0)) - a) / e;
         let dy = (crate::pose::project(h, p + DVec2::new(0.0, e)) - a) / e;
         worst = worst.max(dx.x.abs() + dy.x.abs()).max(dx.y.abs() + dy.y.abs());
-        drift = drift.max(tile.x * (dx.x - 1.0).abs() + tile.y * dy.x.abs()).max(tile.x * dx.y.abs() + tile.y * (dy.y - 1.0).abs());
+        for t in halves {
+            drift = drift.max(t.x * (dx.x - 1.0).abs() + t.y * dy.x.abs()).max(t.x * dx.y.abs() + t.y * (dy.y - 1.0).abs());
+        }
     }
     (worst, drift)
 }

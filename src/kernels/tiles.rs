@@ -59,28 +59,25 @@ pub(super) struct TileKernels {
 
 impl TileKernels {
     /// Those of one interpolation, for so many channels; `planar` where no base warp foreshortens.
-    pub fn new(gpu: &Gpu, support: usize, channels: usize, planar: bool) -> Self {
-        let constants = [
-            ("SUPPORT", support as f64),
-            ("CHANNELS", channels as f64),
-            ("PLANAR", f64::from(u8::from(planar))),
-            ("HELD", held(gpu) as f64),
-        ];
+    fn new(gpu: &Gpu, support: usize, channels: usize, planar: bool, held: usize) -> Self {
+        let constants =
+            [("SUPPORT", support as f64), ("CHANNELS", channels as f64), ("PLANAR", f64::from(u8::from(planar))), ("HELD", held as f64)];
         let forward = |add: f64| Kernel::new(gpu, "blur_tile", BLUR_TILE, &[&constants[..], &[("ACCUMULATE", add)]].concat());
         Self { forward: [forward(0.0), forward(1.0)], adjoint: Kernel::new(gpu, "blur_tile_adjoint", BLUR_TILE_ADJOINT, &constants) }
     }
 }
 
-/// Pixels that workgroup memory holds.
-fn held(gpu: &Gpu) -> usize {
-    gpu.max_workgroup() / 3
-}
+/// Pixels that workgroup memory may hold, of three `f32` each: 16, 20 or 24 KiB, the least that is enough. What a workgroup takes, others that
+/// could run beside it do not have: on an H200, 24 KiB take 1.15 times as long as 16, and 32 KiB 1.8 times.
+pub(super) const HELD: [usize; 3] = [1365, 1706, 2048];
 
 /// What an operator needs to run by tiles.
 pub(super) struct Tiles {
     /// Pixels along either side of a tile of the latent grid.
     side: usize,
     planar: bool,
+    /// Which of [`HELD`].
+    held: usize,
     parts: Vec<Part>,
 }
 
@@ -159,16 +156,16 @@ impl Tiles {
         // lie within half of SIDE - 1 of that, less half a pixel that rounding takes.
         let half = (SIDE as f64 - 1.0) / 2.0 - 0.5;
         let side = (1.0 + 2.0 * (half / spread - support as f64) - 1e-3).floor();
-        let most = held(gpu);
-        if side < LEAST_SIDE as f64 || (SIDE + 1) * (SIDE + 1 + BEYOND) > most {
-            return None;
-        }
+        let sizes = HELD.iter().filter(|h| 3 * **h <= gpu.max_workgroup());
+        let most = *sizes.last().filter(|_| side >= LEAST_SIDE as f64)?;
         let mut all = Vec::new();
         for (base, group) in groups.iter().enumerate() {
             let mut parts = Vec::new();
             split(group.clone(), most, &mut parts);
             all.extend(parts.into_iter().map(|g| (base, g)));
         }
+        let largest = all.iter().map(|(_, g)| Box2::of(g).pixels()).max().unwrap_or(0);
+        let held = HELD.iter().position(|h| *h >= largest)?;
         let (mut parts, mut first) = (Vec::new(), 0);
         while first < all.len() {
             let fits = |end: usize| {
@@ -187,14 +184,14 @@ impl Tiles {
             parts.push(Part { first_base: all[first].0, groups: end - first, forward: upload(false), adjoint: upload(true) });
             first = end;
         }
-        Some(Self { side: side as usize, planar, parts })
+        Some(Self { side: side as usize, planar, held, parts })
     }
 }
 
 impl BlurKernels {
-    fn tiles(&self, gpu: &Gpu, channels: usize, planar: bool) -> &TileKernels {
-        let kernels = &self.tiles[usize::from(channels > 1)][usize::from(planar)];
-        kernels.get_or_init(|| TileKernels::new(gpu, self.support, channels, planar))
+    fn tiles(&self, gpu: &Gpu, channels: usize, tiles: &Tiles) -> &TileKernels {
+        let kernels = &self.tiles[usize::from(channels > 1)][usize::from(tiles.planar)][tiles.held];
+        kernels.get_or_init(|| TileKernels::new(gpu, self.support, channels, tiles.planar, HELD[tiles.held]))
     }
 }
 
@@ -259,7 +256,7 @@ impl Blur {
         latent: &[wgpu::Buffer],
         frame: &[wgpu::Buffer],
     ) -> Vec<Step> {
-        let kernels = kernels.tiles(gpu, scratch.channels(), tiles.planar);
+        let kernels = kernels.tiles(gpu, scratch.channels(), tiles);
         let at_once = self.tile_rows(gpu, tiles).0;
         let mut steps = Vec::new();
         for from in (0..self.frame.1).step_by(at_once) {
@@ -308,7 +305,7 @@ impl Blur {
         latent: &[wgpu::Buffer],
         factor: f32,
     ) -> Vec<Step> {
-        let kernels = kernels.tiles(gpu, scratch.channels(), tiles.planar);
+        let kernels = kernels.tiles(gpu, scratch.channels(), tiles);
         let at_once = self.tile_rows(gpu, tiles).1;
         let mut steps = Vec::new();
         for from in (0..self.latent.1).step_by(at_once) {
