@@ -58,9 +58,15 @@ fn farthest(a: &Rgb, b: &Rgb) -> f32 {
 
 #[test]
 fn less_memory_gives_the_same_irradiance() {
-    let gpu = Gpu::new().expect("an adapter");
-    let kernels = Kernels::new(&gpu);
-    let all = run(&gpu, &kernels, None).expect("solves");
+    // On GPUs most operators run by tiles, which take no scratch.
+    for software in [true, false] {
+        less_memory(&gpu().treated_as(software));
+    }
+}
+
+fn less_memory(gpu: &Gpu) {
+    let kernels = Kernels::new(gpu);
+    let all = run(gpu, &kernels, None).expect("solves");
     let memory = all.report.memory;
     assert!(!memory.streamed && !memory.reduced && memory.channels_together == 3);
     // What was planned is what was made.
@@ -70,8 +76,9 @@ fn less_memory_gives_the_same_irradiance() {
     let least = (72 * n + (4 + 24) * m) as u64;
     assert!(memory.bytes > stated && memory.bytes < stated + stated / 2, "{} for {stated} without scratch", memory.bytes);
 
-    for (limit, streamed, together) in [(memory.bytes - 300_000, false, 3), (stated - 100_000, true, 3), (least + least / 8, true, 1)] {
-        let less = run(&gpu, &kernels, Some(limit)).expect("solves");
+    let limits = [(memory.bytes - 300_000, false, 3), (stated - 100_000, true, 3), (least + least / 8, true, 1)];
+    for (limit, streamed, together) in limits.into_iter().skip(usize::from(!gpu.software)) {
+        let less = run(gpu, &kernels, Some(limit)).expect("solves");
         let how = less.report.memory;
         assert_eq!((how.streamed, how.channels_together), (streamed, together), "{limit} of {}", memory.bytes);
         assert!(how.bytes <= limit && gpu.counted() == how.bytes);
@@ -82,11 +89,11 @@ fn less_memory_gives_the_same_irradiance() {
     }
     // The filter chooses patches: where two are as like, a rounding decides.
     let filtered =
-        [None, Some(least + least / 8)].map(|limit| run_with(&gpu, &kernels, limit, Prior::Collaborative).expect("solves").irradiance);
+        [None, Some(least + least / 8)].map(|limit| run_with(gpu, &kernels, limit, Prior::Collaborative).expect("solves").irradiance);
     let mut far: Vec<f32> = filtered[0].0.iter().zip(&filtered[1].0).flat_map(|(a, b)| a.zip(b, |a, b| (a - b).abs() / a).data).collect();
     far.sort_by(f32::total_cmp);
     assert!(far[far.len() * 98 / 100] < 1e-5 && far[far.len() - 1] < 1e-3, "{} {}", far[far.len() * 98 / 100], far[far.len() - 1]);
-    let error = run(&gpu, &kernels, Some(1 << 20)).err().expect("too little").to_string();
+    let error = run(gpu, &kernels, Some(1 << 20)).err().expect("too little").to_string();
     assert!(error.contains("MiB") && error.contains("--memory-limit") && error.contains("--scale"), "{error}");
 }
 
@@ -136,10 +143,16 @@ fn a_device_that_runs_out_of_memory_is_asked_for_less() {
 /// reads at once it is refused.
 #[test]
 fn frames_beyond_a_binding_are_solved_in_bands() {
-    let all = run(gpu(), kernels(), None).expect("solves");
-    let narrow = Gpu::new().expect("an adapter").with_binding_limit(60_000);
+    for (software, bytes) in [(true, 60_000), (false, 72_000)] {
+        solved_in_bands(&gpu().treated_as(software), bytes);
+    }
+}
+
+fn solved_in_bands(gpu: &Gpu, bytes: u64) {
+    let all = run(gpu, &Kernels::new(gpu), None).expect("solves");
+    let narrow = gpu.treated_as(gpu.software).with_binding_limit(bytes);
     let kernels = Kernels::new(&narrow);
-    assert!(narrow.max_binding() < SIZE.0 * SIZE.1);
+    assert!(narrow.max_binding() < (SIZE.0 + 2 * PAD) * (SIZE.1 + 2 * PAD));
     for limit in [None, Some(all.report.memory.bytes * 3 / 4)] {
         let bands = run(&narrow, &kernels, limit).expect("solves");
         assert!(farthest(&all.irradiance, &bands.irradiance) < 1e-5, "{}", farthest(&all.irradiance, &bands.irradiance));
@@ -147,7 +160,7 @@ fn frames_beyond_a_binding_are_solved_in_bands() {
             assert!(a.data.iter().zip(&b.data).all(|(a, b)| (a - b).abs() <= 1e-3 * (1.0 + a.abs())));
         }
     }
-    let narrower = Gpu::new().expect("an adapter").with_binding_limit(20_000);
+    let narrower = gpu.treated_as(gpu.software).with_binding_limit(20_000);
     let kernels = Kernels::new(&narrower);
     let error = run(&narrower, &kernels, None).err().expect("too large").to_string();
     assert!(error.contains("150 x 110") && error.contains("--scale"), "{error}");
