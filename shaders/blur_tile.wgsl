@@ -108,24 +108,6 @@ fn store(o: i32, value: vec3f) {
     }
 }
 
-// Stores the pixels that lie in the image: `left` of them, from index o on. Written out, as an index that varies would keep the sums in
-// memory.
-fn keep(o: i32, left: i32, pixels: mat4x3f) {
-    let row = params.out_size.x;
-    if left > 0 {
-        store(o, pixels[0]);
-    }
-    if left > 1 {
-        store(o + row, pixels[1]);
-    }
-    if left > 2 {
-        store(o + 2 * row, pixels[2]);
-    }
-    if left > 3 {
-        store(o + 3 * row, pixels[3]);
-    }
-}
-
 @compute @workgroup_size(32, 8)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3u) {
     let corner = vec2i(group.xy) * SIDE + vec2i(0, params.rows.x); // frame pixel of the tile's first
@@ -148,6 +130,6 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
     let p = corner + mine;
     if p.x < params.out_size.x {
         let o = (p.y - params.out_first) * params.out_size.x + p.x;
-        keep(o, params.rows.y - p.y, sum);
+        keep_four(params.out_size.x, o, params.rows.y - p.y, sum);
     }
 }

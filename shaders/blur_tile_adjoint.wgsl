@@ -138,7 +138,7 @@ fn gather(base: Base, p: vec2i, region: vec2i, before: mat4x3f) -> mat4x3f {
     return sum;
 }
 
-fn add(o: i32, value: vec3f) {
+fn store(o: i32, value: vec3f) {
     latent_r[o] += params.factor * value.x;
     if CHANNELS > 1u {
         latent_g[o] += params.factor * value.y;
@@ -186,19 +186,7 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
     let p = corner + mine;
     let left = min(side - mine.y, params.rows.y - p.y);
     if mine.x < side && p.x < params.out_size.x {
-        let row = params.out_size.x;
-        let o = (p.y - params.out_first) * row + p.x;
-        if left > 0 {
-            add(o, gathered[0]);
-        }
-        if left > 1 {
-            add(o + row, gathered[1]);
-        }
-        if left > 2 {
-            add(o + 2 * row, gathered[2]);
-        }
-        if left > 3 {
-            add(o + 3 * row, gathered[3]);
-        }
+        let o = (p.y - params.out_first) * params.out_size.x + p.x;
+        keep_four(params.out_size.x, o, left, gathered);
     }
 }

@@ -660,7 +660,10 @@ impl Run<'_> {
         self.memo.depends(&(self.settings.model, self.settings.focal_px));
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
         let mut slight = Vec::new();
-        let doubted = doubt.is_some() || (may_doubt && blind::less_detailed(&verdicts, &used));
+        let doubted = match &doubt {
+            Some(doubt) => !doubt.show_surely_the_same(),
+            None => may_doubt && blind::less_detailed(&verdicts, &used),
+        };
         if doubted && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
             let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
             let (found, blind) = self.remembered(

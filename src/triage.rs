@@ -30,6 +30,10 @@ pub struct Verdict {
     /// Least over most of that ratio among directions at right angles, the worse pair of them: a lens softens edges of all directions alike, a hand's
     /// motion those across it. 1 where nothing tells.
     pub evenness: f64,
+    /// For each frame, the lesser of the parts that this one has of its fine structure and it of this one's, as they measure without any error, in the
+    /// direction in which they differ most: 1 for blurs alike; `None` where nothing tells.
+    #[serde(skip)]
+    pub alike: Vec<Option<f64>>,
     /// Why, in words.
     pub reason: String,
 }
@@ -375,7 +379,16 @@ pub fn triage(
     let mut all: Vec<Luminance> = frames.par_iter().zip(exposures).zip(curves).map(|((f, x), c)| luminance(f, x, c)).collect();
     let verdict = |a: &Luminance| {
         let (steepness, evenness) = steepness(&a.part(&looked));
-        Verdict { sharp: false, detail: 1.0, compared: false, linked: true, steepness, evenness, reason: String::new() }
+        Verdict {
+            sharp: false,
+            detail: 1.0,
+            compared: false,
+            linked: true,
+            steepness,
+            evenness,
+            alike: vec![None; all.len()],
+            reason: String::new(),
+        }
     };
     let mut verdicts: Vec<Verdict> = all.par_iter().map(verdict).collect();
     // Not before: of a frame that is all texture, which passes for noise, steepness would say too little.
@@ -387,6 +400,8 @@ pub fn triage(
     let of = |&(i, j): &(usize, usize)| details([&all[i], &all[j]], [&parts[i], &parts[j]], &(motions[j] * motions[i].inverse()), &looked);
     let found: Vec<[Option<Share>; 2]> = pairs.iter().map(of).collect();
     for (&(i, j), detail) in pairs.iter().zip(&found) {
+        let alike = detail[0].zip(detail[1]).map(|(a, b)| a.likely.min(b.likely));
+        (verdicts[i].alike[j], verdicts[j].alike[i]) = (alike, alike);
         for (k, own, other) in [(0, i, j), (1, j, i)] {
             if !excluded[other]
                 && let Some(detail) = detail[k]

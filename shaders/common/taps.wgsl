@@ -83,18 +83,3 @@ fn keep(row: i32, o: i32, left: i32, pixels: Pixels) {
     keep_four(row, o + 8 * row, left - 8, pixels.c);
     keep_four(row, o + 12 * row, left - 12, pixels.d);
 }
-
-fn keep_four(row: i32, o: i32, left: i32, pixels: mat4x3f) {
-    if left > 0 {
-        store(o, pixels[0]);
-    }
-    if left > 1 {
-        store(o + row, pixels[1]);
-    }
-    if left > 2 {
-        store(o + 2 * row, pixels[2]);
-    }
-    if left > 3 {
-        store(o + 3 * row, pixels[3]);
-    }
-}

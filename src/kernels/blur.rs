@@ -1,9 +1,8 @@
-//! The blur K of eq. (4) and its exact adjoint Kᵀ, of three channels or one, as warps and shifts (see [`TapSet`]), in two designs:
+//! The blur K of eq. (4) and its exact adjoint Kᵀ, of three channels or one, as warps and shifts (see [`TapSet`]), in three designs:
 //!
 //! * rotate-then-shift: every base warp into a scratch plane, then the sum of shifted planes. Loads little, needs scratch.
 //! * direct: every pose warped straight into the sum. For a set whose taps shift nothing (a pose of its own per tap), above all for a
 //!   frame with a single pose.
-//!
 //! * by tiles, on GPUs: rotate-then-shift in workgroup memory (src/kernels/tiles.rs). Needs no scratch; for warps that turn and stretch little.
 //!
 //! The first two run in bands of frame rows, as tall as scratch, bindings and the time that a dispatch may take allow. K computes a band of the
@@ -34,8 +33,8 @@ pub(super) const WARP_ADJOINT: &str =
     source!("common/plane", "common/texels", "common/image", "common/pose", "common/adjoint", "warp_adjoint");
 pub(super) const WARP_ADJOINT_NEAR: &str =
     source!("common/plane", "common/texels", "common/image", "common/pose", "common/adjoint", "warp_adjoint_near");
-pub(super) const TAP_SUM: &str = source!("common/texels", "common/image", "common/taps", "common/output", "tap_sum");
-pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/image", "common/planes", "common/taps", "tap_adjoint");
+pub(super) const TAP_SUM: &str = source!("common/texels", "common/image", "common/taps", "common/keep", "common/output", "tap_sum");
+pub(super) const TAP_ADJOINT: &str = source!("common/texels", "common/image", "common/planes", "common/taps", "common/keep", "tap_adjoint");
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]

@@ -4,8 +4,8 @@ use super::blur::{BASES, Blur, BlurKernels, Group, Scratch, TABLE, append_runs, 
 use crate::gpu::{Gpu, Kernel, Step};
 use std::ops::Range;
 
-pub(super) const BLUR_TILE: &str = source!("common/plane", "common/pose", "common/tile", "blur_tile");
-pub(super) const BLUR_TILE_ADJOINT: &str = source!("common/plane", "common/pose", "common/tile", "blur_tile_adjoint");
+pub(super) const BLUR_TILE: &str = source!("common/plane", "common/pose", "common/tile", "common/keep", "blur_tile");
+pub(super) const BLUR_TILE_ADJOINT: &str = source!("common/plane", "common/pose", "common/tile", "common/keep", "blur_tile_adjoint");
 
 /// Pixels along either side of what a workgroup makes (K) or sums shifts for (Kᵀ).
 const SIDE: usize = 32;
@@ -96,13 +96,13 @@ fn range(values: impl Iterator<Item = i32>) -> (i32, i32) {
 }
 
 /// Columns and rows that the shifts of `group` read for a tile, and the smallest and the largest shift.
-struct Box2 {
+struct Reach {
     size: (usize, usize),
     x: (i32, i32),
     y: (i32, i32),
 }
 
-impl Box2 {
+impl Reach {
     fn of(group: &Group) -> Self {
         let (x, y) = (range(group.iter().map(|t| t.0)), range(group.iter().map(|t| t.1)));
         Self { size: (SIDE + (x.1 - x.0) as usize, SIDE + (y.1 - y.0) as usize), x, y }
@@ -115,12 +115,12 @@ impl Box2 {
 
 /// `group`, sorted, in parts whose boxes have no more than `most` pixels and whose entries fit a table.
 fn split(group: Group, most: usize, out: &mut Vec<Group>) {
-    let area = Box2::of(&group);
-    if area.pixels() <= most && group.len() <= super::blur::GROUP_TAPS {
+    let reach = Reach::of(&group);
+    if reach.pixels() <= most && group.len() <= super::blur::GROUP_TAPS {
         return out.push(group);
     }
-    let across = area.size.0 >= area.size.1;
-    let middle = if across { (area.x.0 + area.x.1).div_euclid(2) } else { (area.y.0 + area.y.1).div_euclid(2) };
+    let across = reach.size.0 >= reach.size.1;
+    let middle = if across { (reach.x.0 + reach.x.1).div_euclid(2) } else { (reach.y.0 + reach.y.1).div_euclid(2) };
     let (low, high): (Group, Group) = group.into_iter().partition(|t| if across { t.0 <= middle } else { t.1 <= middle });
     split(low, most, out);
     split(high, most, out);
@@ -130,20 +130,20 @@ fn split(group: Group, most: usize, out: &mut Vec<Group>) {
 fn table(groups: &[(usize, Group)], adjoint: bool) -> Vec<[i32; 4]> {
     let mut table = vec![[0i32; 4]; 2 * groups.len()];
     for (g, (base, taps)) in groups.iter().enumerate() {
-        let area = Box2::of(taps);
+        let reach = Reach::of(taps);
         let first = table.len() as i32;
         // K reads base warps at p - shift, Kᵀ the frame at q + shift; both from the corner that the farthest shift reaches.
         let corner = if adjoint {
-            let places: Group = taps.iter().map(|t| (t.0 - area.x.0, t.1 - area.y.0, t.2)).collect();
-            append_runs(&places, area.size.0, &mut table);
-            [area.x.0, area.y.0]
+            let places: Group = taps.iter().map(|t| (t.0 - reach.x.0, t.1 - reach.y.0, t.2)).collect();
+            append_runs(&places, reach.size.0, &mut table);
+            [reach.x.0, reach.y.0]
         } else {
-            let places: Group = taps.iter().rev().map(|t| (area.x.1 - t.0, area.y.1 - t.1, t.2)).collect();
-            append_runs(&places, area.size.0, &mut table);
-            [-area.x.1, -area.y.1]
+            let places: Group = taps.iter().rev().map(|t| (reach.x.1 - t.0, reach.y.1 - t.1, t.2)).collect();
+            append_runs(&places, reach.size.0, &mut table);
+            [-reach.x.1, -reach.y.1]
         };
         let last = groups.get(g + 1).is_none_or(|next| next.0 != *base);
-        table[2 * g] = [corner[0], corner[1], area.size.0 as i32, area.size.1 as i32];
+        table[2 * g] = [corner[0], corner[1], reach.size.0 as i32, reach.size.1 as i32];
         table[2 * g + 1] = [first, table.len() as i32, (base % BASES) as i32, i32::from(last)];
     }
     table
@@ -164,7 +164,7 @@ impl Tiles {
             split(group.clone(), most, &mut parts);
             all.extend(parts.into_iter().map(|g| (base, g)));
         }
-        let largest = all.iter().map(|(_, g)| Box2::of(g).pixels()).max().unwrap_or(0);
+        let largest = all.iter().map(|(_, g)| Reach::of(g).pixels()).max().unwrap_or(0);
         let held = HELD.iter().position(|h| *h >= largest)?;
         let (mut parts, mut first) = (Vec::new(), 0);
         while first < all.len() {

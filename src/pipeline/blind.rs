@@ -116,9 +116,22 @@ pub(super) struct Doubt {
     passing: Vec<usize>,
     /// Those of them whose edges are softer in one direction than across it.
     uneven: Vec<usize>,
+    /// How alike in their fine structure they are, [`Verdict::alike`], along the chain of them by which they are most so; 0 of one or two: two blurs
+    /// may be alike by chance.
+    alike: f64,
 }
 
 impl Doubt {
+    /// Whether the frames stood still because they show the same: no two shakes are alike, let alone three, while a soft lens or scene is the same for all.
+    fn show_the_same(&self) -> bool {
+        self.alike > ALIKE
+    }
+
+    /// Whether that holds for motions of a pixel or two as well.
+    pub fn show_surely_the_same(&self) -> bool {
+        self.alike > SURELY_ALIKE
+    }
+
     /// Whether the frames `still` did not move, if residuals grow by `growth` when they are held.
     fn stands(&self, growth: f64, still: &[usize]) -> bool {
         growth
@@ -150,6 +163,11 @@ const SURELY_STEEP: f64 = 0.60;
 /// Detail up to which a frame that passes for sharp may be blurred, though another frame is surely sharp: most sharp ones measure more. At night, where
 /// little but lamps can be seen, blurred ones may do so too.
 const SURELY_DETAILED: f64 = 0.85;
+/// How alike three frames or more are in their fine structure that stood still: sharp ones measure 0.92 and more in place and 0.77 and more displaced, two
+/// shaken ones that are in doubt up to 0.76.
+const ALIKE: f64 = 0.78;
+/// The same where motions of a pixel or two are out of the question, too: beside a sharp frame 1.5 px leave 0.76 and less.
+const SURELY_ALIKE: f64 = 0.92;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
 /// Growth of the residuals, if frames did not move, up to which they did not.
@@ -217,7 +235,21 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
         return None;
     }
     let of = |is: &dyn Fn(usize) -> bool| frames.iter().copied().filter(|&i| is(i)).collect();
-    Some(Doubt { passing: of(&|i| sharp[i]), uneven: of(&|i| verdicts[i].evenness < UNEVEN), frames })
+    let alike = if frames.len() > 2 { chained(verdicts, &frames) } else { 0.0 };
+    Some(Doubt { passing: of(&|i| sharp[i]), uneven: of(&|i| verdicts[i].evenness < UNEVEN), alike, frames })
+}
+
+/// The least [`Verdict::alike`] along the chain of `frames` along which it is greatest.
+fn chained(verdicts: &[Verdict], frames: &[usize]) -> f64 {
+    let (mut reached, mut others) = (vec![frames[0]], frames[1..].to_vec());
+    let mut least = f64::INFINITY;
+    while !others.is_empty() {
+        let nearest = |k: usize| reached.iter().filter_map(|&i| verdicts[i].alike[others[k]]).fold(0.0, f64::max);
+        let (k, alike) = (0..others.len()).map(|k| (k, nearest(k))).fold((0, -1.0), |a, b| if b.1 > a.1 { b } else { a });
+        least = least.min(alike);
+        reached.push(others.swap_remove(k));
+    }
+    least
 }
 
 /// Frames that pass for sharp with little to spare, and the others that do, where one of those surely is: a steep edge of one frame says nothing
@@ -314,6 +346,10 @@ impl Run<'_> {
         }
         let Some(doubt) = doubt else { return Ok(or_merged(self.joint(used, None, None, &[], from, to)?.0)) };
         let Doubt { frames: alike, passing, .. } = doubt;
+        if doubt.show_the_same() {
+            self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true, "alike": doubt.alike });
+            return Ok(AllBlurs::Sharp(alike.clone()));
+        }
         let frames = if alike.len() > 1 { alike } else { used };
         let mut seen = self.look(frames, from, at(0.2))?;
         let mut growth = 0.0;
@@ -720,7 +756,7 @@ mod tests {
     use super::*;
 
     fn verdict(detail: f64, steepness: f64, sharp: bool) -> Verdict {
-        Verdict { sharp, detail, compared: true, linked: true, steepness, evenness: 1.0, reason: String::new() }
+        Verdict { sharp, detail, compared: true, linked: true, steepness, evenness: 1.0, alike: vec![None; 5], reason: String::new() }
     }
 
     #[test]
@@ -743,6 +779,23 @@ mod tests {
         assert!(!less_detailed(&all, &[0, 3]), "the other one does not pass for sharp");
         assert!(!less_detailed(&all, &[0]), "the other one is not in use");
         assert!(!less_detailed(&all, &[0, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn three_frames_that_show_the_same_stood_still() {
+        let of = |pairs: &[(usize, usize, f64)], count: usize| {
+            let mut all: Vec<Verdict> = (0..count).map(|_| verdict(1.0, 0.5, true)).collect();
+            for &(i, j, alike) in pairs {
+                (all[i].alike[j], all[j].alike[i]) = (Some(alike), Some(alike));
+            }
+            let doubt = doubted(&all, &vec![true; count], &(0..count).collect::<Vec<_>>()).expect("no edge is surely steep");
+            (doubt.alike, doubt.show_the_same(), doubt.show_surely_the_same())
+        };
+        assert_eq!(of(&[(0, 1, 0.99)], 2), (0.0, false, false), "two may be alike by chance");
+        assert_eq!(of(&[(0, 1, 0.99), (1, 2, 0.95)], 3), (0.95, true, true));
+        assert_eq!(of(&[(0, 1, 0.99), (0, 2, 0.5), (1, 2, 0.8)], 3), (0.8, true, false), "a chain by way of the second");
+        assert_eq!(of(&[(0, 1, 0.99), (0, 2, 0.6), (1, 2, 0.7)], 3), (0.7, false, false));
+        assert_eq!(of(&[(0, 1, 0.99), (2, 3, 0.99)], 4), (0.0, false, false), "nothing tells of one half beside the other");
     }
 
     #[test]
@@ -780,6 +833,7 @@ mod tests {
     #[test]
     fn one_frame_alone_is_asked_about_as_it_is() {
         let doubt = |frames: &[usize], passing: &[usize], uneven: &[usize]| Doubt {
+            alike: 0.0,
             frames: frames.to_vec(),
             passing: passing.to_vec(),
             uneven: uneven.to_vec(),
@@ -793,7 +847,7 @@ mod tests {
 
     #[test]
     fn a_frame_whose_edges_are_uneven_has_less_to_show_for_having_moved() {
-        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2] };
+        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2], alike: 0.0 };
         assert!(doubt.stands(1.3, &[0]) && !doubt.stands(1.3, &[1]));
         assert!(doubt.stands(1.1, &[1]), "its residuals hardly grow");
         assert!(!doubt.stands(1.6, &[0]));
