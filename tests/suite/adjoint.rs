@@ -242,7 +242,7 @@ fn more_base_warps_than_a_binding_holds_are_done_in_parts() {
     let taps = TapSet::direct(&tsf, 17, 9);
     assert!(taps.bases.len() > 512);
     // The same with a shift, so that tiles do it.
-    let shifted = TapSet { bases: taps.bases.clone(), taps: taps.taps.iter().map(|t| Tap { dx: 1, ..t.clone() }).collect() };
+    let shifted = TapSet { bases: taps.bases.clone(), taps: taps.taps.iter().map(|t| Tap { dx: 1, ..*t }).collect() };
     for (kind, taps) in kinds().iter().flat_map(|k| [(k, &taps), (k, &shifted)]) {
         let case = Case::new("600 poses", kind, taps, frame, 10, Interpolation::Bilinear);
         case.check_with(case.blur.scratch_wanted());
