@@ -5,14 +5,13 @@
 mod workload;
 
 use std::time::{Duration, Instant};
-use unshaken::deblur::{self, Observation, Prior, Settings};
+use unshaken::deblur::{self, Prior, Settings};
 use unshaken::error::Result;
 use unshaken::gpu::{Gpu, Step, read};
-use unshaken::image::{Plane, Rgb};
-use unshaken::kernels::{Blur, Kernels, NOISE_STEPS, Scratch, channels};
-use unshaken::pose::Pose;
+use unshaken::image::Rgb;
+use unshaken::kernels::{Blur, Kernels, Scratch, channels};
 use unshaken::tsf::{Interpolation, TapSet, Tsf};
-use workload::{noise, workload};
+use workload::{motion, noise, observation, workload};
 
 /// How long each figure is measured at least.
 const LEAST: Duration = Duration::from_millis(200);
@@ -59,24 +58,11 @@ fn operators(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpola
 /// Milliseconds that one iteration takes: the median between reports, of which there is one every five iterations.
 fn iteration(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpolation) -> Result<f64> {
     let values = noise(1, side * side);
-    let plane = || Plane::from_vec(side, side, values.iter().map(|v| 0.1 + 0.8 * v).collect());
-    let poses =
-        workload().taps.iter().map(|t| Pose::planar(f64::from(t.dx), f64::from(t.dy), 0.25 * (t.base as f64 - 6.0), t.weight)).collect();
-    let (still, moved) = (Tsf::identity(), Tsf::new(1000.0, poses)?);
+    let moved = motion();
     println!("  {} taps", TapSet::new(&moved, side, side, interpolation).taps.len());
-    let frames: Result<Vec<Observation>> = (0..FRAMES)
-        .map(|f| {
-            Ok(Observation {
-                exposure: Rgb([plane()?, plane()?, plane()?]),
-                mask: Plane::filled(side, side, 1.0),
-                exposure_time: 1.0,
-                noise: std::array::from_fn(|_| vec![0.02; NOISE_STEPS]),
-                black_clipped: false,
-                tsf: if f < 2 { moved.clone() } else { still.clone() },
-            })
-        })
-        .collect();
-    let (frames, start) = (frames?, Rgb::filled(side, side, 0.5));
+    let tsf = |f: usize| if f < 2 { moved.clone() } else { Tsf::identity() };
+    let frames: Vec<_> = (0..FRAMES).map(|f| observation(side, [values.as_slice(); 3], tsf(f))).collect();
+    let start = Rgb::filled(side, side, 0.5);
     let settings = Settings { outer: 1, inner: 45, interpolation, prior: Prior::Tv, ..Settings::default() };
     let (mut last, mut times) = (Instant::now(), Vec::new());
     deblur::solve(gpu, kernels, &frames, &start, 0, &settings, &mut |_| {

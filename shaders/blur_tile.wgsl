@@ -2,34 +2,6 @@
 // grid.
 override SUPPORT: i32 = 2;
 
-struct Params {
-    in_size: vec2i,    // of the latent grid
-    in_rows: vec2i,    // of it: the first that is bound, and the one after the last
-    offset: vec2i,     // latent pixel of frame pixel (0, 0)
-    out_size: vec2i,   // of the frame
-    rows: vec2i,       // of the frame: the first to compute, and the one after the last
-    centre: vec2f,     // of the frame, pixels
-    in_first: i32,     // row of the latent grid that comes first in the binding
-    out_first: i32,    // row of the frame, likewise
-    groups: i32,
-    _pad: i32,
-}
-
-@group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(3) var<storage, read_write> out_r: array<f32>;
-@group(0) @binding(4) var<storage, read_write> out_g: array<f32>;
-@group(0) @binding(5) var<storage, read_write> out_b: array<f32>;
-@group(0) @binding(6) var<storage, read> in_r: array<f32>;
-@group(0) @binding(7) var<storage, read> in_g: array<f32>;
-@group(0) @binding(8) var<storage, read> in_b: array<f32>;
-
-fn pixel(i: i32) -> vec3f {
-    if CHANNELS > 1u {
-        return vec3f(in_r[i], in_g[i], in_b[i]);
-    }
-    return vec3f(in_r[i], 0.0, 0.0);
-}
-
 // Interpolation weights of positions of which `valid` exist.
 fn weights(x: vec4f, valid: vec4<bool>) -> vec4f {
     return select(vec4f(0.0), interpolation4(x), valid);
@@ -54,7 +26,7 @@ fn source(abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
     let d = clamp(displacement(abc, def, vec2f(q) - params.centre), vec2f(-1e6), vec2f(1e6));
     let whole = floor(d);
     let f = d - whole;
-    let first = q + params.offset + vec2i(whole) - (SUPPORT - 1);
+    let first = q + params.pad + vec2i(whole) - (SUPPORT - 1);
     let start = params.in_first * size.x;
     if SUPPORT == 1 {
         let x = vec2i(first.x, first.x + 1);
@@ -89,28 +61,9 @@ fn source(abc: vec4f, def: vec4f, q: vec2i) -> vec3f {
     return upper + lower;
 }
 
-// Whether to add to what the output holds.
-override ACCUMULATE: bool = false;
-
-fn store(o: i32, value: vec3f) {
-    var sum = value;
-    if ACCUMULATE {
-        sum.x += out_r[o];
-        if CHANNELS > 1u {
-            sum.y += out_g[o];
-            sum.z += out_b[o];
-        }
-    }
-    out_r[o] = sum.x;
-    if CHANNELS > 1u {
-        out_g[o] = sum.y;
-        out_b[o] = sum.z;
-    }
-}
-
 @compute @workgroup_size(32, 8)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3u) {
-    let corner = vec2i(group.xy) * SIDE + vec2i(0, params.rows.x); // frame pixel of the tile's first
+    let corner = vec2i(group.xy) * params.side + vec2i(0, params.rows.x); // frame pixel of the tile's first
     let mine = vec2i(i32(id.x), i32(id.y) * TALL);
     var sum = mat4x3f();
     for (var g = 0; g < params.groups; g += 1) {
@@ -130,6 +83,6 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
     let p = corner + mine;
     if p.x < params.out_size.x {
         let o = (p.y - params.out_first) * params.out_size.x + p.x;
-        keep_four(params.out_size.x, o, params.rows.y - p.y, sum);
+        keep_four(params.out_size.x, o, params.rows.y - p.y, params.factor * sum);
     }
 }

@@ -4,39 +4,10 @@
 // pixels of a column then lie in windows of 2 SUPPORT + 1 pixels, each a row below the one before; see Blur::near for "little".
 override SUPPORT: i32 = 2;
 
-struct Params {
-    in_size: vec2i,    // of the frame
-    in_rows: vec2i,    // of it: the first that is bound, and the one after the last
-    out_size: vec2i,   // of the latent grid
-    rows: vec2i,       // of the latent grid: the first to compute, and the one after the last
-    pad: vec2i,        // latent pixel of frame pixel (0, 0)
-    centre: vec2f,     // of the frame, pixels
-    in_first: i32,     // row of the frame that comes first in the binding
-    out_first: i32,    // row of the latent grid, likewise
-    groups: i32,
-    side: i32,         // of a tile
-    factor: f32,       // of everything that is added
-    _pad0: f32,
-    _pad1: vec2f,
-}
-
-@group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(3) var<storage, read_write> latent_r: array<f32>;
-@group(0) @binding(4) var<storage, read_write> latent_g: array<f32>;
-@group(0) @binding(5) var<storage, read_write> latent_b: array<f32>;
-@group(0) @binding(6) var<storage, read> in_r: array<f32>;
-@group(0) @binding(7) var<storage, read> in_g: array<f32>;
-@group(0) @binding(8) var<storage, read> in_b: array<f32>;
-
 // The frame, 0 beyond it.
-fn pixel(q: vec2i) -> vec3f {
+fn seen(q: vec2i) -> vec3f {
     let near = clamp(q, vec2i(0, params.in_rows.x), vec2i(params.in_size.x, params.in_rows.y) - 1);
-    let i = (near.y - params.in_first) * params.in_size.x + near.x;
-    var value = vec3f(in_r[i], 0.0, 0.0);
-    if CHANNELS > 1u {
-        value.y = in_g[i];
-        value.z = in_b[i];
-    }
+    let value = pixel((near.y - params.in_first) * params.in_size.x + near.x);
     return select(vec3f(0.0), value, all(near == q));
 }
 
@@ -138,14 +109,6 @@ fn gather(base: Base, p: vec2i, region: vec2i, before: mat4x3f) -> mat4x3f {
     return sum;
 }
 
-fn store(o: i32, value: vec3f) {
-    latent_r[o] += params.factor * value.x;
-    if CHANNELS > 1u {
-        latent_g[o] += params.factor * value.y;
-        latent_b[o] += params.factor * value.z;
-    }
-}
-
 @compute @workgroup_size(32, 8)
 fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index) lane: u32, @builtin(workgroup_id) group: vec3u) {
     let side = params.side;
@@ -165,7 +128,7 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
         let reciprocal = 1.0 / f32(box.z);
         workgroupBarrier();
         for (var i = i32(lane); i < box.z * box.w; i += LANES) {
-            hold(i, pixel(origin + place(i, box.z, reciprocal)));
+            hold(i, seen(origin + place(i, box.z, reciprocal)));
         }
         workgroupBarrier();
         sum = shifts(sum, mine.y * box.z + mine.x, box.z, run.x, run.y);
@@ -187,6 +150,6 @@ fn main(@builtin(local_invocation_id) id: vec3u, @builtin(local_invocation_index
     let left = min(side - mine.y, params.rows.y - p.y);
     if mine.x < side && p.x < params.out_size.x {
         let o = (p.y - params.out_first) * params.out_size.x + p.x;
-        keep_four(params.out_size.x, o, left, gathered);
+        keep_four(params.out_size.x, o, left, params.factor * gathered);
     }
 }

@@ -7,13 +7,12 @@ mod workload;
 use criterion::Criterion;
 use rotate_shift::RotateShift;
 use std::time::Instant;
-use unshaken::deblur::{self, Observation, Settings};
+use unshaken::deblur::{self, Settings};
 use unshaken::gpu::{Gpu, Step, read};
-use unshaken::image::{Plane, Rgb};
-use unshaken::kernels::{Blur, DeviceRgb, Kernels, NOISE_STEPS, Scratch, channels};
-use unshaken::pose::Pose;
-use unshaken::tsf::{Interpolation, TapSet, Tsf};
-use workload::{noise, workload};
+use unshaken::image::Rgb;
+use unshaken::kernels::{Blur, DeviceRgb, Kernels, Scratch, channels};
+use unshaken::tsf::{Interpolation, TapSet};
+use workload::{motion, noise, observation, workload};
 
 /// Side of the workload's square frame, pixels.
 const SIDE: usize = 1024;
@@ -72,24 +71,6 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
-/// One shaken frame under the workload's motion, and a flat start.
-fn observation(taps: &TapSet, image: &[Vec<f32>; 3]) -> (Observation, Rgb) {
-    let plane = |c: usize| Plane::from_vec(SIDE, SIDE, image[c].iter().map(|v| 0.1 + 0.8 * v).collect()).expect("the frame's size");
-    let poses = taps.taps.iter().map(|t| {
-        let angle = 0.25 * (t.base as f64 - 6.0);
-        Pose::planar(f64::from(t.dx), f64::from(t.dy), angle, t.weight)
-    });
-    let observation = Observation {
-        exposure: Rgb([plane(0), plane(1), plane(2)]),
-        mask: Plane::filled(SIDE, SIDE, 1.0),
-        exposure_time: 1.0,
-        noise: std::array::from_fn(|_| vec![0.02; NOISE_STEPS]),
-        black_clipped: false,
-        tsf: Tsf::new(1000.0, poses.collect()).expect("a motion"),
-    };
-    (observation, Rgb::filled(SIDE, SIDE, 0.5))
-}
-
 fn main() {
     let taps = workload();
     let image = [1, 2, 3].map(|seed| noise(seed, SIDE * SIDE));
@@ -133,7 +114,8 @@ fn main() {
     println!("| K | {k:.0} | {k_cpu:.0} | {:.2} |\n| adjoint of K | {t:.0} | {t_cpu:.0} | {:.2} |", k / k_cpu, t / t_cpu);
 
     // An iteration: the difference between long and short solves.
-    let (observation, start) = observation(&taps, &image);
+    let observation = observation(SIDE, image.each_ref().map(Vec::as_slice), motion());
+    let start = Rgb::filled(SIDE, SIDE, 0.5);
     let kernels = Kernels::new(&device.gpu);
     let solve = |inner: usize| {
         let settings = Settings { outer: 1, inner, interpolation: Interpolation::Bilinear, ..Settings::default() };

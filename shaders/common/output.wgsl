@@ -1,4 +1,4 @@
-// What K writes: one or three planes of the frame, at bindings 3 to 5. No entry points.
+// What K writes, and its adjoint by tiles: one or three planes, at bindings 3 to 5. No entry points.
 // Whether to add to what the output holds: no parameter, because software rasterisers run both sides of a branch.
 override ACCUMULATE: bool = false;
 // Channels that the operator works on at a time: 3, or only the first.

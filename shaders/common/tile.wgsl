@@ -4,16 +4,43 @@
 // An invocation makes TALL pixels of a column. `table` starts with two entries for every group of shifts that share a base warp: the
 // corner of what they read, relative to the tile, and its size; then first and last entry of the shifts, the base, and whether the base's
 // shifts end with this group. Entries of shifts are those of taps.wgsl; `place` is relative to the corner.
-// Channels that the operator works on at a time: 3, or only the first.
-override CHANNELS: u32 = 3u;
+// Output is that of output.wgsl.
 // Pixels that workgroup memory holds.
 override HELD: u32 = 1365u;
 const SIDE: i32 = 32;
 const TALL: i32 = 4;
 const LANES: i32 = 256;
 
+struct Params {
+    in_size: vec2i,    // of the latent grid (K), of the frame (adjoint)
+    in_rows: vec2i,    // of it: the first that is bound, and the one after the last
+    out_size: vec2i,   // of the frame (K), of the latent grid (adjoint)
+    rows: vec2i,       // of it: the first to compute, and the one after the last
+    pad: vec2i,        // latent pixel of frame pixel (0, 0)
+    centre: vec2f,     // of the frame, pixels
+    in_first: i32,     // row of the input that comes first in the binding
+    out_first: i32,    // row of the output, likewise
+    groups: i32,
+    side: i32,         // of a tile
+    factor: f32,       // of everything that is written
+    _pad0: f32,
+    _pad1: vec2f,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<uniform> bases: array<Base, 512>;
 @group(0) @binding(2) var<uniform> table: array<vec4i, 4096>;
+@group(0) @binding(6) var<storage, read> in_r: array<f32>;
+@group(0) @binding(7) var<storage, read> in_g: array<f32>;
+@group(0) @binding(8) var<storage, read> in_b: array<f32>;
+
+// Value i of the input's binding.
+fn pixel(i: i32) -> vec3f {
+    if CHANNELS > 1u {
+        return vec3f(in_r[i], in_g[i], in_b[i]);
+    }
+    return vec3f(in_r[i], 0.0, 0.0);
+}
 
 var<workgroup> held_r: array<f32, HELD>;
 var<workgroup> held_g: array<f32, HELD>;

@@ -22,8 +22,8 @@ use std::sync::OnceLock;
 const IMAGE: [&str; 2] = [source!("common/image"), source!("common/image_storage")];
 const PLANES: [&str; 2] = [source!("common/planes"), source!("common/planes_storage")];
 /// What stands for a pixel of three channels, and of one, in those sources: types that no constant changes.
-const ONE_CHANNEL: [[(&str, &str); 2]; 2] =
-    [[("array<vec4f>", "array<f32>"), ("vec4f(value, 0.0)", "value.x")], [("rgba32float", "r32float"), ("", "")]];
+const ONE_CHANNEL: [&[(&str, &str)]; 2] =
+    [&[("array<vec4f>", "array<f32>"), ("vec4f(value, 0.0)", "value.x")], &[("rgba32float", "r32float")]];
 pub(super) const PADDED: &str = source!("common/plane", "common/texels", "common/planes", "padded");
 pub(super) const WARP: &str =
     source!("common/plane", "common/texels", "common/image", "common/planes", "common/pose", "common/warp", "warp");
@@ -151,8 +151,8 @@ impl BlurKernels {
             let kind = usize::from(gpu.software);
             let own = |source: &str| {
                 let source = source.replace(IMAGE[0], IMAGE[kind]).replace(PLANES[0], PLANES[kind]);
-                let pixel = ONE_CHANNEL[kind].iter().filter(|p| channels == 1 && !p.0.is_empty());
-                pixel.fold(source, |source, p| source.replace(p.0, p.1))
+                let pixel: &[_] = if channels == 1 { ONE_CHANNEL[kind] } else { &[] };
+                pixel.iter().fold(source, |source, p| source.replace(p.0, p.1))
             };
             let kernel = |label, source: &str, constants: &[(&str, f64)]| Kernel::new(gpu, label, &own(source), constants);
             let adding = |label, source, constants: &[(&'static str, f64)]| {
@@ -635,7 +635,7 @@ impl Blur {
         frame: &[wgpu::Buffer],
     ) -> Vec<Step> {
         if let Some(tiles) = &self.tiles {
-            return self.forward_tiles(gpu, kernels, tiles, scratch, latent, frame);
+            return self.by_tiles(gpu, kernels, tiles, scratch, false, latent, frame, 1.0);
         }
         let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);
@@ -700,7 +700,7 @@ impl Blur {
         factor: f32,
     ) -> Vec<Step> {
         if let Some(tiles) = &self.tiles {
-            return self.adjoint_tiles(gpu, kernels, tiles, scratch, frame, latent, factor);
+            return self.by_tiles(gpu, kernels, tiles, scratch, true, frame, latent, factor);
         }
         let kernels = kernels.compiled(gpu, scratch.channels());
         let cut = self.cut(gpu, scratch);

@@ -4,8 +4,9 @@ use super::blur::{BASES, Blur, BlurKernels, Group, Scratch, TABLE, append_runs, 
 use crate::gpu::{Gpu, Kernel, Step};
 use std::ops::Range;
 
-pub(super) const BLUR_TILE: &str = source!("common/plane", "common/pose", "common/tile", "common/keep", "blur_tile");
-pub(super) const BLUR_TILE_ADJOINT: &str = source!("common/plane", "common/pose", "common/tile", "common/keep", "blur_tile_adjoint");
+pub(super) const BLUR_TILE: &str = source!("common/plane", "common/pose", "common/output", "common/tile", "common/keep", "blur_tile");
+pub(super) const BLUR_TILE_ADJOINT: &str =
+    source!("common/plane", "common/pose", "common/output", "common/tile", "common/keep", "blur_tile_adjoint");
 
 /// Pixels along either side of what a workgroup makes (K) or sums shifts for (Kᵀ).
 const SIDE: usize = 32;
@@ -17,21 +18,6 @@ const LEAST_SIDE: usize = 12;
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct TileParams {
-    in_size: [i32; 2],
-    in_rows: [i32; 2],
-    offset: [i32; 2],
-    out_size: [i32; 2],
-    rows: [i32; 2],
-    centre: [f32; 2],
-    in_first: i32,
-    out_first: i32,
-    groups: i32,
-    _pad: i32,
-}
-
-#[repr(C)]
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct TileAdjointParams {
     in_size: [i32; 2],
     in_rows: [i32; 2],
     out_size: [i32; 2],
@@ -47,7 +33,7 @@ struct TileAdjointParams {
 }
 
 pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
-    vec![("blur_tile", size_of::<TileParams>()), ("blur_tile_adjoint", size_of::<TileAdjointParams>())]
+    ["blur_tile", "blur_tile_adjoint"].map(|s| (s, size_of::<TileParams>())).to_vec()
 }
 
 /// The compiled kernels.
@@ -62,8 +48,9 @@ impl TileKernels {
     fn new(gpu: &Gpu, support: usize, channels: usize, planar: bool, held: usize) -> Self {
         let constants =
             [("SUPPORT", support as f64), ("CHANNELS", channels as f64), ("PLANAR", f64::from(u8::from(planar))), ("HELD", held as f64)];
-        let forward = |add: f64| Kernel::new(gpu, "blur_tile", BLUR_TILE, &[&constants[..], &[("ACCUMULATE", add)]].concat());
-        Self { forward: [forward(0.0), forward(1.0)], adjoint: Kernel::new(gpu, "blur_tile_adjoint", BLUR_TILE_ADJOINT, &constants) }
+        let kernel = |label, source, add: f64| Kernel::new(gpu, label, source, &[&constants[..], &[("ACCUMULATE", add)]].concat());
+        let forward = [0.0, 1.0].map(|add| kernel("blur_tile", BLUR_TILE, add));
+        Self { forward, adjoint: kernel("blur_tile_adjoint", BLUR_TILE_ADJOINT, 1.0) }
     }
 }
 
@@ -168,10 +155,8 @@ impl Tiles {
         let held = HELD.iter().position(|h| *h >= largest)?;
         let (mut parts, mut first) = (Vec::new(), 0);
         while first < all.len() {
-            let fits = |end: usize| {
-                all[end].0 / BASES == all[first].0 / BASES
-                    && table(&all[first..=end], false).len().max(table(&all[first..=end], true).len()) <= TABLE
-            };
+            // Kᵀ's table is as long: it has the same runs.
+            let fits = |end: usize| all[end].0 / BASES == all[first].0 / BASES && table(&all[first..=end], false).len() <= TABLE;
             let mut end = first + 1;
             while end < all.len() && fits(end) {
                 end += 1;
@@ -220,126 +205,84 @@ impl Blur {
         low..high.max(low + 1)
     }
 
-    /// Frame rows of K, latent rows of Kᵀ that one dispatch may make: multiples of a tile's.
-    fn tile_rows(&self, gpu: &Gpu, tiles: &Tiles) -> (usize, usize) {
+    /// Size of what K, or Kᵀ, reads, of what it writes, and the side of a tile of that.
+    fn grids(&self, tiles: &Tiles, adjoint: bool) -> ((usize, usize), (usize, usize), usize) {
+        if adjoint { (self.frame, self.latent, tiles.side) } else { (self.latent, self.frame, SIDE) }
+    }
+
+    /// Rows of what it reads whose values it uses for the rows `rows` of what it writes.
+    fn rows_used(&self, rows: &Range<usize>, adjoint: bool) -> Range<usize> {
+        if adjoint { self.rows_seen(rows) } else { self.rows_read(rows) }
+    }
+
+    /// The bands of `rows` rows of what it writes.
+    fn tile_bands(&self, tiles: &Tiles, adjoint: bool, rows: usize) -> impl Iterator<Item = Range<usize>> + use<> {
+        let all = self.grids(tiles, adjoint).1.1;
+        (0..all).step_by(rows).map(move |y| y..(y + rows).min(all))
+    }
+
+    /// Rows that one dispatch may make: a multiple of a tile's.
+    fn tile_rows(&self, gpu: &Gpu, tiles: &Tiles, adjoint: bool) -> usize {
         let warps = self.homographies.len() as f64 * crate::tsf::WARP_COST * (2 * self.support).pow(2) as f64;
         let budget = gpu.dispatch_budget / ((self.taps as f64 + warps) * self.latent.0 as f64);
-        let cut = |side: usize, all: usize, fits: &dyn Fn(Range<usize>) -> bool| {
-            let mut rows = (budget as usize).min(all.next_multiple_of(side)) / side * side;
-            rows = rows.max(side);
-            while rows > side && !(0..all).step_by(rows).all(|y| fits(y..(y + rows).min(all))) {
-                rows = (rows / 2).next_multiple_of(side);
-            }
-            rows
-        };
-        let forward =
-            cut(SIDE, self.frame.1, &|r| gpu.rows_fit(r.len(), self.frame) && gpu.rows_fit(self.rows_read(&r).len(), self.latent));
-        let adjoint =
-            cut(tiles.side, self.latent.1, &|r| gpu.rows_fit(r.len(), self.latent) && gpu.rows_fit(self.rows_seen(&r).len(), self.frame));
-        (forward, adjoint)
+        let (input, output, side) = self.grids(tiles, adjoint);
+        let fits = |r: Range<usize>| gpu.rows_fit(r.len(), output) && gpu.rows_fit(self.rows_used(&r, adjoint).len(), input);
+        let mut rows = ((budget as usize).min(output.1.next_multiple_of(side)) / side * side).max(side);
+        while rows > side && !self.tile_bands(tiles, adjoint, rows).all(fits) {
+            rows = (rows / 2).next_multiple_of(side);
+        }
+        rows
     }
 
     /// Rows of either grid that the lowest bands bind at once.
     pub(super) fn tile_rows_at_once(&self, tiles: &Tiles) -> usize {
-        let read = (0..self.frame.1).step_by(SIDE).map(|y| self.rows_read(&(y..(y + SIDE).min(self.frame.1))).len());
-        let seen = (0..self.latent.1).step_by(tiles.side).map(|y| self.rows_seen(&(y..(y + tiles.side).min(self.latent.1))).len());
-        read.chain(seen).fold(SIDE, usize::max)
+        let used = |adjoint: bool| {
+            let bands = self.tile_bands(tiles, adjoint, self.grids(tiles, adjoint).2);
+            bands.map(move |r| self.rows_used(&r, adjoint).len())
+        };
+        used(false).chain(used(true)).fold(SIDE, usize::max)
     }
 
-    /// [`Blur::forward`] by tiles.
-    pub(super) fn forward_tiles(
+    /// [`Blur::forward`] by tiles, or [`Blur::adjoint`].
+    pub(super) fn by_tiles(
         &self,
         gpu: &Gpu,
         kernels: &BlurKernels,
         tiles: &Tiles,
         scratch: &Scratch,
-        latent: &[wgpu::Buffer],
-        frame: &[wgpu::Buffer],
-    ) -> Vec<Step> {
-        let kernels = kernels.tiles(gpu, scratch.channels(), tiles);
-        let at_once = self.tile_rows(gpu, tiles).0;
-        let mut steps = Vec::new();
-        for from in (0..self.frame.1).step_by(at_once) {
-            let rows = from..(from + at_once).min(self.frame.1);
-            let read = self.rows_read(&rows);
-            let ([r, g, b], in_first) = scratch.rows(gpu, latent, self.latent, read.clone(), false);
-            let ([x, y, z], out_first) = scratch.rows(gpu, frame, self.frame, rows.clone(), true);
-            for (p, part) in tiles.parts.iter().enumerate() {
-                let params = TileParams {
-                    in_size: [self.latent.0 as i32, self.latent.1 as i32],
-                    in_rows: [read.start as i32, read.end as i32],
-                    offset: [self.pad as i32; 2],
-                    out_size: [self.frame.0 as i32, self.frame.1 as i32],
-                    rows: [rows.start as i32, rows.end as i32],
-                    centre: self.centre().as_vec2().to_array(),
-                    in_first,
-                    out_first,
-                    groups: part.groups as i32,
-                    _pad: 0,
-                };
-                let bound = [
-                    self.bases(part.first_base),
-                    part.forward.as_entire_binding(),
-                    x.clone(),
-                    y.clone(),
-                    z.clone(),
-                    r.clone(),
-                    g.clone(),
-                    b.clone(),
-                ];
-                let groups = grid([self.frame.0 as i32, rows.len() as i32], (SIDE, SIDE), 1);
-                steps.push(kernels.forward[usize::from(p > 0)].step_parts(gpu, &params, &bound, groups));
-            }
-        }
-        steps
-    }
-
-    /// [`Blur::adjoint`] by tiles.
-    pub(super) fn adjoint_tiles(
-        &self,
-        gpu: &Gpu,
-        kernels: &BlurKernels,
-        tiles: &Tiles,
-        scratch: &Scratch,
-        frame: &[wgpu::Buffer],
-        latent: &[wgpu::Buffer],
+        adjoint: bool,
+        from: &[wgpu::Buffer],
+        to: &[wgpu::Buffer],
         factor: f32,
     ) -> Vec<Step> {
         let kernels = kernels.tiles(gpu, scratch.channels(), tiles);
-        let at_once = self.tile_rows(gpu, tiles).1;
+        let (input, output, side) = self.grids(tiles, adjoint);
+        let pair = |size: (usize, usize)| [size.0 as i32, size.1 as i32];
         let mut steps = Vec::new();
-        for from in (0..self.latent.1).step_by(at_once) {
-            let rows = from..(from + at_once).min(self.latent.1);
-            let seen = self.rows_seen(&rows);
-            let ([r, g, b], in_first) = scratch.rows(gpu, frame, self.frame, seen.clone(), false);
-            let ([x, y, z], out_first) = scratch.rows(gpu, latent, self.latent, rows.clone(), true);
-            for part in &tiles.parts {
-                let params = TileAdjointParams {
-                    in_size: [self.frame.0 as i32, self.frame.1 as i32],
-                    in_rows: [seen.start as i32, seen.end as i32],
-                    out_size: [self.latent.0 as i32, self.latent.1 as i32],
-                    rows: [rows.start as i32, rows.end as i32],
+        for rows in self.tile_bands(tiles, adjoint, self.tile_rows(gpu, tiles, adjoint)) {
+            let used = self.rows_used(&rows, adjoint);
+            let ([r, g, b], in_first) = scratch.rows(gpu, from, input, used.clone(), false);
+            let ([x, y, z], out_first) = scratch.rows(gpu, to, output, rows.clone(), true);
+            for (p, part) in tiles.parts.iter().enumerate() {
+                let params = TileParams {
+                    in_size: pair(input),
+                    in_rows: pair((used.start, used.end)),
+                    out_size: pair(output),
+                    rows: pair((rows.start, rows.end)),
                     pad: [self.pad as i32; 2],
                     centre: self.centre().as_vec2().to_array(),
                     in_first,
                     out_first,
                     groups: part.groups as i32,
-                    side: tiles.side as i32,
+                    side: side as i32,
                     factor,
                     _pad: [0.0; 3],
                 };
-                let bound = [
-                    self.bases(part.first_base),
-                    part.adjoint.as_entire_binding(),
-                    x.clone(),
-                    y.clone(),
-                    z.clone(),
-                    r.clone(),
-                    g.clone(),
-                    b.clone(),
-                ];
-                let groups = grid([self.latent.0 as i32, rows.len() as i32], (tiles.side, tiles.side), 1);
-                steps.push(kernels.adjoint.step_parts(gpu, &params, &bound, groups));
+                let (kernel, table) =
+                    if adjoint { (&kernels.adjoint, &part.adjoint) } else { (&kernels.forward[usize::from(p > 0)], &part.forward) };
+                let table = table.as_entire_binding();
+                let bound = [self.bases(part.first_base), table, x.clone(), y.clone(), z.clone(), r.clone(), g.clone(), b.clone()];
+                steps.push(kernel.step_parts(gpu, &params, &bound, grid(pair((output.0, rows.len())), (side, side), 1)));
             }
         }
         steps

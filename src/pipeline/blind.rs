@@ -245,9 +245,9 @@ fn chained(verdicts: &[Verdict], frames: &[usize]) -> f64 {
     let mut least = f64::INFINITY;
     while !others.is_empty() {
         let nearest = |k: usize| reached.iter().filter_map(|&i| verdicts[i].alike[others[k]]).fold(0.0, f64::max);
-        let (k, alike) = (0..others.len()).map(|k| (k, nearest(k))).fold((0, -1.0), |a, b| if b.1 > a.1 { b } else { a });
-        least = least.min(alike);
-        reached.push(others.swap_remove(k));
+        let next = (0..others.len()).max_by(|&a, &b| nearest(a).total_cmp(&nearest(b))).expect("some are left");
+        least = least.min(nearest(next));
+        reached.push(others.swap_remove(next));
     }
     least
 }
