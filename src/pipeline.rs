@@ -26,8 +26,8 @@ use std::time::Instant;
 mod blind;
 mod engine;
 
-use blind::AllBlurs;
 pub use blind::Blind;
+use blind::{AllBlurs, SetFree};
 pub use engine::Engine;
 use engine::Memo;
 
@@ -172,6 +172,9 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
+/// Extent in pixels from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard as a pixel show what the
+/// warps cannot (under one of 1.5 px up to half of it).
+const LONG: f64 = 12.0;
 /// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
 const SLIGHT: f64 = 4.0;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
@@ -325,6 +328,25 @@ fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
         return Err(Error::Input(format!("patch {x},{y} lies outside the frames, which are {w} x {h} pixels counted from 0,0")));
     }
     Ok(excluded)
+}
+
+/// A bracket of which it is known which frames are sharp.
+struct Sorted {
+    verdicts: Vec<Verdict>,
+    /// Whether a TSF was given.
+    known: Vec<bool>,
+    used: Vec<usize>,
+    sharp: Vec<bool>,
+    tsfs: Vec<Option<Tsf>>,
+    /// Where no frame shows the scene: what to start from instead.
+    scene: Option<Rgb>,
+    centre: Option<usize>,
+    /// Whether the TSFs of all frames come from a smaller size.
+    reduced: bool,
+    /// Whether the frames are merged as they are.
+    unexplained: bool,
+    /// Whether sharp frames may have moved by a pixel or two all the same.
+    may_have_moved: bool,
 }
 
 impl Run<'_> {
@@ -537,11 +559,7 @@ impl Run<'_> {
         let mut sharp: Vec<bool> =
             (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, |t| t.single().is_some())).collect();
         let all_known = used.iter().all(|&i| tsfs[i].is_some());
-        // Where no frame shows the scene: what to start from instead.
-        let mut scene: Option<Rgb> = None;
-        let mut centre: Option<usize> = None;
-        // Whether the TSFs of all frames come from a smaller size.
-        let mut reduced = false;
+        let (mut scene, mut centre, mut reduced) = (None, None, false);
         let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
         let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
         let doubt = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
@@ -595,7 +613,20 @@ impl Run<'_> {
                 sharp[i] = true;
             }
         }
+        let may_have_moved = match &doubt {
+            Some(doubt) => !doubt.show_surely_the_same(),
+            None => may_doubt && blind::less_detailed(&verdicts, &used),
+        };
+        self.deblurred(Sorted { verdicts, known, used, sharp, tsfs, scene, centre, reduced, unexplained, may_have_moved })
+    }
+
+    /// The irradiance of a bracket that is `sorted`.
+    fn deblurred(mut self, sorted: Sorted) -> Result<Outcome> {
+        let Sorted { verdicts, known, used, mut sharp, mut tsfs, scene, centre, mut reduced, unexplained, may_have_moved } = sorted;
+        let frames = self.bracket.frames();
+        let (w, h) = self.bracket.size();
         let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        let noise = (self.noise.clone(), self.curves.clone());
         // Blurred frames that are merged as they are differ by their blurs as well.
         if !unexplained {
             self.measure_noise(&still)?;
@@ -660,11 +691,7 @@ impl Run<'_> {
         self.memo.depends(&(self.settings.model, self.settings.focal_px));
         let mut shaken: Vec<usize> = shaken.into_iter().filter(|&i| tsfs[i].is_some()).collect();
         let mut slight = Vec::new();
-        let doubted = match &doubt {
-            Some(doubt) => !doubt.show_surely_the_same(),
-            None => may_doubt && blind::less_detailed(&verdicts, &used),
-        };
-        if doubted && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
+        if may_have_moved && base.is_some() && !unexplained && still.len() + shaken.len() > 1 {
             let all: Vec<usize> = still.iter().chain(&shaken).copied().collect();
             let (found, blind) = self.remembered(
                 "slight blur",
@@ -676,9 +703,28 @@ impl Run<'_> {
                 },
             )?;
             self.blind = blind;
-            if let Some(found) = found {
+            if let Some(SetFree::Beside(stood)) = found {
+                // Once more from these alone, without what was found beside the others.
+                self.memo.depends(&stood);
+                (self.noise, self.curves) = noise;
+                for &i in &all {
+                    (sharp[i], tsfs[i]) = (stood.contains(&i), None);
+                }
+                return self.deblurred(Sorted {
+                    verdicts,
+                    known,
+                    used: all,
+                    sharp,
+                    tsfs,
+                    scene: None,
+                    centre: None,
+                    reduced: false,
+                    unexplained: false,
+                    may_have_moved: false,
+                });
+            }
+            if let Some(SetFree::All(found)) = found {
                 (latent, reduced, base) = (found.start, found.reduced, None);
-                let (w, h) = self.bracket.size();
                 for (&i, tsf) in all.iter().zip(found.tsfs) {
                     if tsf::extent(&tsf, w, h) < SLIGHT {
                         slight.push(i);
@@ -720,7 +766,10 @@ impl Run<'_> {
             let solved =
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
-            let judge = |&i: &usize| Some((i, self.unexplained(i, misfit(i)?, &start)?));
+            let judge = |&i: &usize| {
+                let extent = tsf::extent(tsfs[i].as_ref()?, w, h);
+                Some((i, self.unexplained(i, misfit(i)?, &start, (UNEXPLAINED * LONG / extent).clamp(UNEXPLAINED, 1.0))?))
+            };
             // TSFs of a smaller size err by pixels of the frame's: they are judged once they have been refined.
             let rough = reduced && round + 1 < rounds;
             let hopeless: Vec<(usize, f64)> = shaken.iter().filter(|i| !rough && !slight.contains(i)).filter_map(judge).collect();
@@ -910,8 +959,9 @@ impl Run<'_> {
 
     /// Whether the blur of frame `i` fails to explain it: `misfit` is the local χ² with it, `start` the irradiance before the frame counted.
     /// Judged over squares of the frame in which one or the other is far above the noise, by the one in the middle: what moved, or a lamp
-    /// that blur spreads beyond white, is a part of the frame and not its shake. The χ² of that one, where it fails.
-    fn unexplained(&self, i: usize, misfit: &Plane, start: &Rgb) -> Option<f64> {
+    /// that blur spreads beyond white, is a part of the frame and not its shake. It fails where it leaves more than `most` of what is left without; the χ² of
+    /// the square in the middle, where it does.
+    fn unexplained(&self, i: usize, misfit: &Plane, start: &Rgb, most: f64) -> Option<f64> {
         let without = self.unblurred(i, start);
         let (w, h) = misfit.size();
         let side = (w.max(h) / SQUARES).max(LEAST_SQUARE);
@@ -941,7 +991,7 @@ impl Run<'_> {
         };
         let chi = middle(squares.iter().map(|s| s.0).collect());
         let left = middle(squares.iter().map(|s| s.1).collect());
-        (chi > HOPELESS && left > UNEXPLAINED).then_some(chi)
+        (chi > HOPELESS && left > most).then_some(chi)
     }
 
     /// Squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred; NaN where it is masked.

@@ -523,22 +523,27 @@ impl Look {
 
 /// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
 /// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
-/// scene is not what the smoothness takes it for, too long. What the best way found, with the draws that it goes on with, and all ways, the
-/// best first. `None` as for [`at_coarsest`].
+/// scene is not what the smoothness takes it for, too long. `plain` is what was found without. What the best way found, with the draws that it goes on
+/// with, and all ways, the best first. `None` as for [`at_coarsest`].
 fn at_second(
     finer: &Level,
-    look: Look,
+    look: &Look,
+    plain: State,
     starts: &[Start],
     advance: &mut dyn FnMut(usize) -> bool,
 ) -> Option<(State, Option<Random>, Vec<Way>)> {
     let Look { level, state } = look;
     let mut random = Random::new(SEED, 0);
-    let drawn = at_coarsest(&level, starts, Some(&mut random), &mut || advance(level.scale))?;
+    let drawn = at_coarsest(level, starts, Some(&mut random), &mut || advance(level.scale))?;
+    let mut second =
+        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
+    let mut at_last = Random::new(SEED, 1);
+    let finer_drawn = second(state, &mut at_last)?;
+    let all_drawn = second(&drawn, &mut random)?;
     let mut best = None;
     let mut ways = Vec::new();
-    let tries = [(Draws::None, state.clone(), None), (Draws::Finer, state, Some(Random::new(SEED, 1))), (Draws::All, drawn, Some(random))];
-    for (draws, from, mut random) in tries {
-        let state = at_finer(finer, from, &level, ROUNDS.1, random.as_mut(), &mut || advance(finer.scale))?;
+    let found = [(Draws::None, plain, None), (Draws::Finer, finer_drawn, Some(at_last)), (Draws::All, all_drawn, Some(random))];
+    for (draws, state, random) in found {
         let held_out = geometric_mean(&finer.judge(&state));
         ways.push(Way { draws, held_out });
         best = Some(better(best, (held_out, (state, random))));
@@ -547,14 +552,39 @@ fn at_second(
     best.map(|(_, (state, random))| (state, random, ways))
 }
 
+/// `state` of `level` at the level `last`, which it is or a finer one, and that level. `None` as for [`at_coarsest`].
+fn at_last(
+    frames: &[Frame],
+    mut level: Level,
+    mut state: State,
+    last: usize,
+    mut draws: Option<Random>,
+    advance: &mut dyn FnMut(usize) -> bool,
+) -> Option<(Level, State)> {
+    while level.scale > last {
+        let finer = Level::new(frames, level.scale / 2, true);
+        state = at_finer(&finer, state, &level, ROUNDS.2, draws.as_mut(), &mut || advance(finer.scale))?;
+        level = finer;
+    }
+    Some((level, state))
+}
+
+/// Frames that may not have moved.
+pub struct Doubted<'a> {
+    /// Positions among the frames; none where all did.
+    pub frames: &'a [usize],
+    /// Growth of the residuals, if they are held, up to which they surely stood still: nothing is to be drawn then.
+    pub surely: f64,
+}
+
 /// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`; `look` where one at these frames from these starts was
-/// taken already. `doubted`: frames that may not have moved. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
+/// taken already. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
 /// ends the work: `None`, as for no start.
 pub fn estimate(
     frames: &[Frame],
     starts: &[Start],
     look: Option<Look>,
-    doubted: &[usize],
+    doubted: &Doubted,
     merged: (&Plane, &[Tsf]),
     progress: &mut dyn FnMut(Stage) -> bool,
 ) -> Option<Joint> {
@@ -566,7 +596,7 @@ pub fn estimate(
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += cost(s, ROUNDS.2);
+        total += cost(s, ROUNDS.2) * if doubted.frames.is_empty() { 1.0 } else { 2.0 };
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -578,21 +608,34 @@ pub fn estimate(
         Some(look) => look,
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
-    let (mut level, mut state, mut draws, ways) = match next {
-        None => (look.level, look.state, None, Vec::new()),
+    let asked = |level: &Level, state: &State| if doubted.frames.is_empty() { 1.0 } else { level.growth(state, doubted.frames) };
+    let (level, state, ways, if_still) = match next {
+        None => {
+            let growth = asked(&look.level, &look.state);
+            (look.level, look.state, Vec::new(), growth)
+        }
         Some(scale) => {
             let finer = Level::new(frames, scale, true);
-            let (state, draws, ways) = at_second(&finer, look, starts, &mut advance)?;
-            (finer, state, draws, ways)
+            let plain = at_finer(&finer, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))?;
+            let still = if doubted.frames.is_empty() {
+                None
+            } else {
+                let (level, state) = at_last(frames, Level::new(frames, scale, true), plain.clone(), last, None, &mut advance)?;
+                let growth = level.growth(&state, doubted.frames);
+                (growth < doubted.surely).then_some((level, state, Vec::new(), growth))
+            };
+            match still {
+                Some(still) => still,
+                None => {
+                    let (state, draws, ways) = at_second(&finer, &look, plain, starts, &mut advance)?;
+                    let (level, state) = at_last(frames, finer, state, last, draws, &mut advance)?;
+                    let growth = asked(&level, &state);
+                    (level, state, ways, growth)
+                }
+            }
         }
     };
-    while level.scale > last {
-        let finer = Level::new(frames, level.scale / 2, true);
-        state = at_finer(&finer, state, &level, ROUNDS.2, draws.as_mut(), &mut || advance(finer.scale))?;
-        level = finer;
-    }
     let held_out = level.judge(&state);
-    let if_still = if doubted.is_empty() { 1.0 } else { level.growth(&state, doubted) };
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
     let mut still = level.placed(merged.0, merged.1, state.reference);
     level.settle(&mut still);

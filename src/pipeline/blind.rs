@@ -1,7 +1,7 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run, Settings};
-use crate::blind::{self, Frame, Lack, Look, PatchSetup, Start};
+use crate::blind::{self, Doubted, Frame, Lack, Look, PatchSetup, Start};
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
@@ -109,6 +109,15 @@ pub(super) enum AllBlurs {
     Unexplained,
 }
 
+/// What frames did that were taken for sharp, where one of them at least moved by a pixel or two.
+#[derive(Clone)]
+pub(super) enum SetFree {
+    /// All of them moved.
+    All(Found),
+    /// These stood still.
+    Beside(Vec<usize>),
+}
+
 /// Frames that may be sharp, of which none surely is.
 pub(super) struct Doubt {
     frames: Vec<usize>,
@@ -132,14 +141,18 @@ impl Doubt {
         self.alike > SURELY_ALIKE
     }
 
+    /// Growth of the residuals, when the frames `still` are held, up to which they did not move.
+    fn most_growth(&self, still: &[usize]) -> f64 {
+        match still {
+            [one] if self.uneven.contains(one) => STOOD_STILL.uneven,
+            [_] => STOOD_STILL.alone,
+            _ => STOOD_STILL.together,
+        }
+    }
+
     /// Whether the frames `still` did not move, if residuals grow by `growth` when they are held.
     fn stands(&self, growth: f64, still: &[usize]) -> bool {
-        growth
-            < match still {
-                [one] if self.uneven.contains(one) => STOOD_STILL.uneven,
-                [_] => STOOD_STILL.alone,
-                _ => STOOD_STILL.together,
-            }
+        growth < self.most_growth(still)
     }
 
     /// Whether a look by which the frames in doubt stood still, residuals growing by `growth` if they are held, does not settle it: one frame alone can
@@ -183,6 +196,8 @@ struct StoodStill {
 /// Sharp frames in place and displaced measure up to 1.3 alone and 1.5 together, frames blurred by 4 px and more from 1.5 and 2.9 on, and 1.25 where
 /// what the others did contains the one's motion.
 const STOOD_STILL: StoodStill = StoodStill { uneven: 1.2, alone: 1.5, together: 2.0 };
+/// Part of the growth beyond 1 up to which frames surely did not move, whatever way the others' blurs were found.
+const SURELY: f64 = 0.5;
 /// Evenness up to which edges are softer in one direction than across it: sharp frames without a surely steep edge measure 0.89 and more (of those
 /// with one, a bridge over water 0.84), shaken ones 0.77 to 1.0.
 const UNEVEN: f64 = 0.86;
@@ -199,7 +214,7 @@ const CONFIRMED: f64 = 2.25;
 const LESS_DETAILED: f64 = 0.9;
 
 /// What frames have to show, once those that were taken for sharp may move, for that to be believed.
-struct SetFree {
+struct Shown {
     /// Residuals over those before, at most.
     left: f64,
     /// [`blind::Freed::unlike`], at least.
@@ -208,15 +223,19 @@ struct SetFree {
 
 /// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.76 and more, but for a soft lens, 0.65 and a
 /// blur that is round (0.08).
-const ONE_SET_FREE: SetFree = SetFree { left: 0.73, unlike: 0.25 };
+const ONE_SET_FREE: Shown = Shown { left: 0.73, unlike: 0.25 };
 /// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
-const SEVERAL_SET_FREE: SetFree = SetFree { left: 0.9, unlike: 0.12 };
+const SEVERAL_SET_FREE: Shown = Shown { left: 0.9, unlike: 0.12 };
 /// [`blind::Freed::held_out`] at most: what the frames do not agree about beyond is no motion. Aliasing leaves up to 9 at a full well of 4000 electrons, and as
 /// much more as there is less noise.
 const AGREED: f64 = 300.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
+
+/// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did: sharp frames beside one of 1.5 px measure
+/// up to 0.9, frames of 1.5 px from 1.45 on.
+const STILL: f64 = 1.2;
 
 /// Longer and shorter side at most, in pixels, of the part of large frames in which frames that pass for sharp are set free.
 const FREE_WINDOW: (usize, usize) = (540, 360);
@@ -450,7 +469,8 @@ impl Run<'_> {
         let from = self.surrounded(scene, 0, pad, still, &judged);
         let solved = self.solve(&all, &tsfs, &from, pad, &settings, 0.02, 0.02)?;
         let misfits = all.iter().zip(&solved.misfit).skip(still.len());
-        let failing: Vec<usize> = misfits.filter(|(i, misfit)| self.unexplained(**i, misfit, scene).is_some()).map(|(i, _)| *i).collect();
+        let failing: Vec<usize> =
+            misfits.filter(|(i, misfit)| self.unexplained(**i, misfit, scene, super::UNEXPLAINED).is_some()).map(|(i, _)| *i).collect();
         Ok(without(&blurred, &failing))
     }
 
@@ -599,11 +619,13 @@ impl Run<'_> {
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
         let places = places(asked, used);
+        let surely = doubt.map_or(0.0, |doubt| 1.0 + SURELY * (doubt.most_growth(asked) - 1.0));
+        let doubted = Doubted { frames: &places, surely };
         let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
         let events = &mut self.events;
-        let found = blind::estimate(&frames, &starts, look, &places, (&merged.mean_of(channels), &still), &mut |s| {
+        let found = blind::estimate(&frames, &starts, look, &doubted, (&merged.mean_of(channels), &still), &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
             events(Event::Progress { stage: format!("{why}: estimating all blurs{size}"), fraction: from + (to - from) * s.fraction })
         })
@@ -671,7 +693,7 @@ impl Run<'_> {
         tsfs: &[Option<Tsf>],
         latent: &Rgb,
         reference: usize,
-    ) -> Result<Option<Found>> {
+    ) -> Result<Option<SetFree>> {
         let Some(centre) = used.iter().position(|&i| i == reference) else { return Ok(None) };
         let channels = self.most_telling(used, used);
         let mut frames = self.luminance_frames(used, channels);
@@ -712,6 +734,10 @@ impl Run<'_> {
         if !believed {
             return Ok(None);
         }
+        let stood: Vec<usize> = places.iter().filter(|&&k| found.extents[k] < STILL).map(|&k| used[k]).collect();
+        if !stood.is_empty() {
+            return Ok(Some(SetFree::Beside(stood)));
+        }
         self.blind["believed"] = json!(true);
         if let Some(window) = window {
             // What the window tells of those set free is refined on the frame, with the others. A roll far from the frame's centre is a shift there, and
@@ -725,10 +751,10 @@ impl Run<'_> {
             for (&i, tsf) in used.iter().zip(&tsfs) {
                 self.motions[i] = tsf.centre();
             }
-            return Ok(Some(Found { start: latent.clone(), tsfs, reference, reduced: true }));
+            return Ok(Some(SetFree::All(Found { start: latent.clone(), tsfs, reference, reduced: true })));
         }
         let start = self.scene(used, &found.tsfs, &found.luminance, channels);
-        Ok(Some(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 }))
+        Ok(Some(SetFree::All(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 })))
     }
 
     /// Masks by which the frame `i` alone counts.

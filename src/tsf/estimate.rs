@@ -243,10 +243,31 @@ const FEW: usize = 50;
 /// Continuous poses at most.
 const MOST: usize = 250;
 
-/// What [`thinned`] tries, the least sparse first: sparsity as a part of the standard deviation that the TSF leaves, and whether only what hangs
-/// together stays.
-const THINNED: [(f64, bool); 8] =
-    [(0.0, false), (0.25, false), (0.5, false), (1.0, false), (2.0, false), (0.25, true), (0.5, true), (1.0, true)];
+/// Which poses [`thinned`] tries.
+#[derive(Clone, Copy)]
+enum Kept {
+    /// All.
+    All,
+    /// Those that hang together and weigh most.
+    Path,
+    /// Those near where the frame lies, whatever the level before found: a short blur.
+    Near,
+}
+
+/// What [`thinned`] tries, the least sparse first: sparsity as a part of the standard deviation that the TSF leaves, and what is kept.
+const THINNED: [(f64, Kept); 9] = [
+    (0.0, Kept::All),
+    (0.25, Kept::All),
+    (0.5, Kept::All),
+    (1.0, Kept::All),
+    (2.0, Kept::All),
+    (0.25, Kept::Path),
+    (0.5, Kept::Path),
+    (1.0, Kept::Path),
+    (1.0, Kept::Near),
+];
+/// Pixels from there up to which poses are near.
+const NEAR: usize = 3;
 /// Distance in pixels up to which two poses of a camera's path hang together.
 const LINK: f64 = 3.0;
 
@@ -255,13 +276,15 @@ const LINK: f64 = 3.0;
 /// on its extent.
 fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
     let held = HeldOut::of(rows, frame.size());
-    let fitted = |evidence: &Evidence, noise: f64, (sparsity, connected): (f64, bool)| {
-        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * noise)?;
-        if connected { main_path(&found, chart) } else { Some(found) }
+    let near = near(chart).unwrap_or_default();
+    let fitted = |evidence: &Evidence, noise: f64, (sparsity, kept): (f64, Kept)| {
+        let from = if matches!(kept, Kept::Near) { &near } else { &tsf.poses };
+        let found = evidence.weigh(from, chart.focal, sparsity * noise)?;
+        if matches!(kept, Kept::Path) { main_path(&found, chart) } else { Some(found) }
     };
     let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
     let noise = inside.misfit(tsf).sqrt();
-    let attempt = |&how: &(f64, bool)| {
+    let attempt = |&how: &(f64, Kept)| {
         let found = gathered(&fitted(&inside, noise, how)?, chart)?;
         Some((how, held.blocks(&judge.residual(&inside.refine(&found, chart, 3)))))
     };
@@ -270,6 +293,26 @@ fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
     let sparsest = best.and_then(|best| tried.iter().rev().find(|t| Worse::than(&t.1, &best.1).forgivable()));
     let all = Evidence::new(frame, rows);
     sparsest.and_then(|t| fitted(&all, all.misfit(tsf).sqrt(), t.0)).unwrap_or_else(|| tsf.clone())
+}
+
+/// A short blur about where the frame lies, if it explains what it is not fitted to not clearly worse than `long`, which a coarser level found: beside
+/// lamps, far poses answer there to what the latent irradiance lacks.
+fn short(frame: &WholeFrame, long: &Tsf, model: Model) -> Option<Tsf> {
+    let size = frame.size();
+    let chart = Chart::new(model, long.focal_px, size.0, size.1);
+    let held = HeldOut::of(&frame.rows(ROWS, margin(long, size)), size);
+    let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
+    let blocks = |tsf: &Tsf| held.blocks(&judge.residual(tsf));
+    let long = inside.refine(&gathered(long, &chart)?, &chart, 5);
+    let few = gathered(&inside.weigh(&near(&chart)?, chart.focal, inside.misfit(&long).sqrt())?, &chart)?;
+    let short = inside.refine(&few, &chart, 5);
+    Worse::than(&blocks(&short), &blocks(&long)).forgivable().then_some(short)
+}
+
+/// The lattice poses up to [`NEAR`] pixels from where the frame lies.
+fn near(chart: &Chart) -> Option<Vec<Pose>> {
+    let grown = (0..NEAR).try_fold(Tsf::identity(), |t, _| Tsf::new(chart.focal, around(&t, chart, 1.0)));
+    grown.ok().map(|t| t.poses)
 }
 
 /// The poses of `tsf` that hang together and weigh most.
@@ -332,8 +375,12 @@ impl WholeFrame<'_> {
             let rows = frame.rows(ROWS, margin);
             here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
             tsf = here.scaled(scale);
-            if l == 0 || extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
+            if l == 0 {
                 break;
+            }
+            if extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
+                let Some(short) = short(&level(l - 1), &here.scaled(2.0), planar) else { break };
+                tsf = short.scaled(0.5 * scale);
             }
             l -= 1;
         }

@@ -2,7 +2,7 @@
 
 use crate::oracle::blur as oracle;
 use crate::support::{assert_close, f64s, noise, uniform};
-use unshaken::blind::{self, Draws, Frame, Lack, Look, Operator, PatchSetup, Stage, Start, fix_warp};
+use unshaken::blind::{self, Doubted, Draws, Frame, Lack, Look, Operator, PatchSetup, Stage, Start, fix_warp};
 use unshaken::image::Plane;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch, Psf};
@@ -18,6 +18,10 @@ fn path(n: usize, from: [f64; 3], to: [f64; 3], bend: f64) -> Tsf {
         })
         .collect();
     Tsf::new(150.0, poses).unwrap()
+}
+
+fn all_moved() -> Doubted<'static> {
+    Doubted { frames: &[], surely: 0.0 }
 }
 
 #[test]
@@ -152,7 +156,7 @@ fn scene_and_shakes_are_found_together() {
     let merged = mean(&frames);
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = 0.0;
-    let found = blind::estimate(&frames, &starts, None, &[], (&merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, None, &all_moved(), (&merged, &still()), &mut |s| {
         assert!(s.fraction >= last && s.fraction <= 1.001, "progress goes on: {last} to {}", s.fraction);
         last = s.fraction;
         true
@@ -171,9 +175,15 @@ fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
     let merged = mean(&frames);
-    let found =
-        blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], None, &[0, 1], (&merged, &still()), &mut |_| true)
-            .unwrap();
+    let found = blind::estimate(
+        &frames,
+        &[Start { reference: 0, luminance: merged.clone() }],
+        None,
+        &Doubted { frames: &[0, 1], surely: 1.25 },
+        (&merged, &still()),
+        &mut |_| true,
+    )
+    .unwrap();
     for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
         assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
     }
@@ -187,12 +197,13 @@ fn the_way_with_the_least_residual_at_the_second_level_goes_on() {
     let frames = frames_of(size, &tiles(size.0 + 2 * PAD, size.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = Stage { scale: 2, fraction: 0.0 };
-    let found = blind::estimate(&frames, &starts, None, &[0, 1], (&frames[1].blurred, &still()), &mut |s| {
-        assert!(s.fraction > last.fraction && s.scale <= last.scale, "progress goes on: {last:?} to {s:?}");
-        last = s;
-        true
-    })
-    .unwrap();
+    let found =
+        blind::estimate(&frames, &starts, None, &Doubted { frames: &[0, 1], surely: 1.25 }, (&frames[1].blurred, &still()), &mut |s| {
+            assert!(s.fraction > last.fraction, "progress goes on: {last:?} to {s:?}");
+            last = s;
+            true
+        })
+        .unwrap();
     assert!(last.scale == 1 && (last.fraction - 1.0).abs() < 1e-3, "the end is announced as {last:?}");
     assert!([Draws::None, Draws::Finer, Draws::All].iter().all(|d| found.ways.iter().any(|w| w.draws == *d)), "{:?}", found.ways);
     assert!(found.ways.len() == 3 && found.ways.iter().all(|w| w.held_out >= found.ways[0].held_out), "{:?}", found.ways);
@@ -201,6 +212,29 @@ fn the_way_with_the_least_residual_at_the_second_level_goes_on() {
     assert!((end - found.ways[0].held_out).abs() < 1e-9 * end, "{:?} and in the end {end}", found.ways);
     assert!(found.if_still > 3.0, "held still they are not explained: {}", found.if_still);
     assert!(end < 0.25 * blind::geometric_mean(&found.held_out_merge), "{end}, the merge {:?}", found.held_out_merge);
+}
+
+#[test]
+fn frames_that_surely_stood_still_are_not_asked_about_by_drawn_scenes() {
+    let size = (264, 48);
+    let hard = tiles(size.0 + 2 * PAD, size.1 + 2 * PAD);
+    let mut tsfs = shakes();
+    (tsfs[0], tsfs[1]) = (Tsf::identity(), Tsf::identity());
+    let frames = frames_of(size, &hard, &tsfs);
+    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+    let asked = |surely: f64| {
+        let mut rounds = 0;
+        let doubted = Doubted { frames: &[0, 1], surely };
+        let found = blind::estimate(&frames, &starts, None, &doubted, (&frames[0].blurred, &still()), &mut |_| {
+            rounds += 1;
+            true
+        });
+        (found.unwrap(), rounds)
+    };
+    let ((soon, few), (late, many)) = (asked(1.5), asked(0.0));
+    assert!(soon.if_still < 1.5 && late.if_still < 1.5, "held still they are explained as well: {}, {}", soon.if_still, late.if_still);
+    assert!(soon.ways.is_empty() && 2 * few < many, "{few} rounds and {many}: {:?}", soon.ways);
+    assert_eq!(late.ways.len(), 3);
 }
 
 #[test]
@@ -213,7 +247,7 @@ fn a_look_that_was_taken_serves_the_estimate() {
     let mut rounds = 0;
     let mut estimate = |look: Option<Look>| {
         rounds = 0;
-        let found = blind::estimate(&frames, &starts, look, &[], (&merged, &still()), &mut |_| {
+        let found = blind::estimate(&frames, &starts, look, &all_moved(), (&merged, &still()), &mut |_| {
             rounds += 1;
             true
         });
@@ -316,7 +350,7 @@ fn the_joint_estimate_can_be_cancelled() {
     let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut calls = 0;
-    let found = blind::estimate(&frames, &starts, None, &[], (&mean(&frames), &still()), &mut |_| {
+    let found = blind::estimate(&frames, &starts, None, &all_moved(), (&mean(&frames), &still()), &mut |_| {
         calls += 1;
         calls < 2
     });
