@@ -233,8 +233,10 @@ const AGREED: f64 = 300.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
-/// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did: sharp frames beside one of 1.5 px measure
-/// up to 0.9, frames of 1.5 px from 1.45 on.
+/// Extent in pixels from which a frame that passes for sharp did not move after all: so long a blur would show in its fine structure.
+const TOO_FAR: f64 = 6.0;
+/// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did, slightly: sharp frames beside one of 1.5
+/// px measure up to 0.9, frames of 1.5 px from 1.45 on. What JPEG makes of lamps seems to move by more.
 const STILL: f64 = 1.2;
 
 /// Longer and shorter side at most, in pixels, of the part of large frames in which frames that pass for sharp are set free.
@@ -714,7 +716,8 @@ impl Run<'_> {
         })
         .ok_or(Error::Cancelled)?;
         let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
-        let moved = places.iter().any(|&k| found.extents[k] > SHAKEN);
+        let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
+        let moved = longest > SHAKEN && longest < TOO_FAR;
         let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < AGREED;
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
@@ -734,9 +737,9 @@ impl Run<'_> {
         if !believed {
             return Ok(None);
         }
-        let stood: Vec<usize> = places.iter().filter(|&&k| found.extents[k] < STILL).map(|&k| used[k]).collect();
-        if !stood.is_empty() {
-            return Ok(Some(SetFree::Beside(stood)));
+        let (stood, moved) = places.iter().partition::<Vec<usize>, _>(|&&k| found.extents[k] < STILL);
+        if !stood.is_empty() && moved.iter().all(|&k| found.extents[k] < super::SLIGHT) {
+            return Ok(Some(SetFree::Beside(stood.iter().map(|&k| used[k]).collect())));
         }
         self.blind["believed"] = json!(true);
         if let Some(window) = window {
