@@ -626,7 +626,7 @@ impl Run<'_> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-        let noise = (self.noise.clone(), self.curves.clone());
+        let noise = (self.noise, self.curves.clone());
         // Blurred frames that are merged as they are differ by their blurs as well.
         if !unexplained {
             self.measure_noise(&still)?;
