@@ -254,8 +254,9 @@ enum Kept {
     Near,
 }
 
-/// What [`thinned`] tries, the least sparse first: sparsity as a part of the standard deviation that the TSF leaves, and what is kept.
+/// What [`thinned`] tries, first what is taken only where all others are clearly worse, then the least sparse: sparsity as a part of the standard deviation that the TSF leaves, and what is kept.
 const THINNED: [(f64, Kept); 9] = [
+    (1.0, Kept::Near),
     (0.0, Kept::All),
     (0.25, Kept::All),
     (0.5, Kept::All),
@@ -264,7 +265,6 @@ const THINNED: [(f64, Kept); 9] = [
     (0.25, Kept::Path),
     (0.5, Kept::Path),
     (1.0, Kept::Path),
-    (1.0, Kept::Near),
 ];
 /// Pixels from there up to which poses are near.
 const NEAR: usize = 3;

@@ -161,32 +161,6 @@ fn lamps_in_a_chain_do_not_widen_the_blur() {
     assert!(error < 0.08, "operator error {error:.3}");
 }
 
-/// Where little but lamps tells the blur, and the sharp frame shows them otherwise than they are, far poses explain a coarse level as well.
-#[test]
-fn a_short_blur_beside_lamps_is_found() {
-    let (size, pad) = ((256, 160), 24);
-    let (w, h) = (size.0 + 2 * pad, size.1 + 2 * pad);
-    let truth = path(300.0, |t| Pose::planar(1.4 * t, 1.4 * (1.0 - 4.0 * t * t), 0.1 * t, 1.0));
-    for (seed, lamps, wrong) in [(2, 8, 0.0), (3, 30, 0.6), (4, 8, 0.3)] {
-        let (mut scene, mut latent) = (Plane::filled(w, h, 0.05), Plane::filled(w, h, 0.05));
-        for lamp in numbers(seed, 3 * lamps).chunks(3) {
-            let lies = DVec2::new((0.5 + f64::from(lamp[0])) * w as f64, (0.5 + f64::from(lamp[1])) * h as f64);
-            let bright = 2.0f32.powf(6.0 * lamp[2]);
-            let seen_as = bright * (1.0 + wrong * (lamp[0] + lamp[1])) / (1.0 + wrong);
-            for j in 0..w * h {
-                let d = (DVec2::new((j % w) as f64, (j / w) as f64) - lies).length_squared();
-                scene.data[j] += bright * (-d / 0.8).exp() as f32;
-                latent.data[j] += seen_as * (-d / (0.8 + f64::from(wrong))).exp() as f32;
-            }
-        }
-        let (blurred, weight) = shaken(&scene, pad, &truth, size);
-        let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
-        let found = frame.estimate(&search(Model::Rigid, Some(300.0))).expect("lamps determine it");
-        let error = operator_error(&scene, pad, &found.tsf, &truth, size);
-        assert!(error < 0.3, "{lamps} lamps (seed {seed}): operator error {error:.3}");
-    }
-}
-
 #[test]
 fn blur_of_three_and_of_fifty_pixels_is_found() {
     let (size, pad) = ((224, 176), 40);
