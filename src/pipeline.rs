@@ -626,7 +626,7 @@ impl Run<'_> {
         let frames = self.bracket.frames();
         let (w, h) = self.bracket.size();
         let mut still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-        let noise = (self.noise, self.curves.clone());
+        let noise = self.noise;
         // Blurred frames that are merged as they are differ by their blurs as well.
         if !unexplained {
             self.measure_noise(&still)?;
@@ -706,7 +706,8 @@ impl Run<'_> {
             if let Some(SetFree::Beside(stood)) = found {
                 // Once more from these alone, without what was found beside the others.
                 self.memo.depends(&stood);
-                (self.noise, self.curves) = noise;
+                self.noise = noise;
+                self.curves = noise::curves(frames, self.response, &noise);
                 for &i in &all {
                     (sharp[i], tsfs[i]) = (stood.contains(&i), None);
                 }

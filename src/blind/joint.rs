@@ -537,12 +537,12 @@ fn at_second(
     let drawn = at_coarsest(level, starts, Some(&mut random), &mut || advance(level.scale))?;
     let mut second =
         |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
-    let mut at_last = Random::new(SEED, 1);
-    let finer_drawn = second(state, &mut at_last)?;
+    let mut from_second = Random::new(SEED, 1);
+    let finer_drawn = second(state, &mut from_second)?;
     let all_drawn = second(&drawn, &mut random)?;
     let mut best = None;
     let mut ways = Vec::new();
-    let found = [(Draws::None, plain, None), (Draws::Finer, finer_drawn, Some(at_last)), (Draws::All, all_drawn, Some(random))];
+    let found = [(Draws::None, plain, None), (Draws::Finer, finer_drawn, Some(from_second)), (Draws::All, all_drawn, Some(random))];
     for (draws, state, random) in found {
         let held_out = geometric_mean(&finer.judge(&state));
         ways.push(Way { draws, held_out });

@@ -685,9 +685,8 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// The TSFs of all of the frames `used` and a scene to start from if the frames `still` among them, which were taken for sharp in doubt, moved by
-    /// a pixel or two: if that explains all frames better than the TSFs `tsfs` found while they stood, by more than a harder scene behind a softer
-    /// lens, which blurs them alike.
+    /// Whether some of the frames `still` among those `used`, which were taken for sharp in doubt, moved by a pixel or two: if that explains all frames
+    /// better than the TSFs `tsfs` found while they stood, by more than a harder scene behind a softer lens, which blurs them alike.
     pub(super) fn set_free(
         &mut self,
         used: &[usize],

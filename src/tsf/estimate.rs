@@ -243,30 +243,11 @@ const FEW: usize = 50;
 /// Continuous poses at most.
 const MOST: usize = 250;
 
-/// Which poses [`thinned`] tries.
-#[derive(Clone, Copy)]
-enum Kept {
-    /// All.
-    All,
-    /// Those that hang together and weigh most.
-    Path,
-    /// Those near where the frame lies, whatever the level before found: a short blur.
-    Near,
-}
-
-/// What [`thinned`] tries, first what is taken only where all others are clearly worse, then the least sparse: sparsity as a part of the standard deviation that the TSF leaves, and what is kept.
-const THINNED: [(f64, Kept); 9] = [
-    (1.0, Kept::Near),
-    (0.0, Kept::All),
-    (0.25, Kept::All),
-    (0.5, Kept::All),
-    (1.0, Kept::All),
-    (2.0, Kept::All),
-    (0.25, Kept::Path),
-    (0.5, Kept::Path),
-    (1.0, Kept::Path),
-];
-/// Pixels from there up to which poses are near.
+/// What [`thinned`] tries, the least sparse first: sparsity as a part of the standard deviation that the TSF leaves, and whether only what hangs
+/// together stays.
+const THINNED: [(f64, bool); 8] =
+    [(0.0, false), (0.25, false), (0.5, false), (1.0, false), (2.0, false), (0.25, true), (0.5, true), (1.0, true)];
+/// Pixels from where the frame lies up to which poses are near.
 const NEAR: usize = 3;
 /// Distance in pixels up to which two poses of a camera's path hang together.
 const LINK: f64 = 3.0;
@@ -276,15 +257,13 @@ const LINK: f64 = 3.0;
 /// on its extent.
 fn thinned(frame: &WholeFrame, tsf: &Tsf, rows: &[Row], chart: &Chart) -> Tsf {
     let held = HeldOut::of(rows, frame.size());
-    let near = near(chart).unwrap_or_default();
-    let fitted = |evidence: &Evidence, noise: f64, (sparsity, kept): (f64, Kept)| {
-        let from = if matches!(kept, Kept::Near) { &near } else { &tsf.poses };
-        let found = evidence.weigh(from, chart.focal, sparsity * noise)?;
-        if matches!(kept, Kept::Path) { main_path(&found, chart) } else { Some(found) }
+    let fitted = |evidence: &Evidence, noise: f64, (sparsity, connected): (f64, bool)| {
+        let found = evidence.weigh(&tsf.poses, chart.focal, sparsity * noise)?;
+        if connected { main_path(&found, chart) } else { Some(found) }
     };
     let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
     let noise = inside.misfit(tsf).sqrt();
-    let attempt = |&how: &(f64, Kept)| {
+    let attempt = |&how: &(f64, bool)| {
         let found = gathered(&fitted(&inside, noise, how)?, chart)?;
         Some((how, held.blocks(&judge.residual(&inside.refine(&found, chart, 3)))))
     };
