@@ -521,20 +521,30 @@ impl Look {
     }
 }
 
+/// What `look` saw at the second level, `finer`, without drawn scenes. `None` as for [`at_coarsest`].
+fn without_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> bool) -> Option<State> {
+    at_finer(finer, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(finer.scale))
+}
+
 /// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
 /// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
-/// scene is not what the smoothness takes it for, too long. `plain` is what was found without. What the best way found, with the draws that it goes on
+/// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if
+/// that is known. What the best way found, with the draws that it goes on
 /// with, and all ways, the best first. `None` as for [`at_coarsest`].
 fn at_second(
     finer: &Level,
     look: &Look,
-    plain: State,
+    plain: Option<State>,
     starts: &[Start],
     advance: &mut dyn FnMut(usize) -> bool,
 ) -> Option<(State, Option<Random>, Vec<Way>)> {
     let Look { level, state } = look;
     let mut random = Random::new(SEED, 0);
     let drawn = at_coarsest(level, starts, Some(&mut random), &mut || advance(level.scale))?;
+    let plain = match plain {
+        Some(plain) => plain,
+        None => without_draws(finer, look, advance)?,
+    };
     let mut second =
         |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
     let mut from_second = Random::new(SEED, 1);
@@ -609,31 +619,26 @@ pub fn estimate(
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
     let asked = |level: &Level, state: &State| if doubted.frames.is_empty() { 1.0 } else { level.growth(state, doubted.frames) };
-    let (level, state, ways, if_still) = match next {
-        None => {
+    let (level, state, ways, if_still) = 'found: {
+        let Some(scale) = next else {
             let growth = asked(&look.level, &look.state);
-            (look.level, look.state, Vec::new(), growth)
-        }
-        Some(scale) => {
-            let finer = Level::new(frames, scale, true);
-            let plain = at_finer(&finer, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))?;
-            let still = if doubted.frames.is_empty() {
-                None
-            } else {
-                let (level, state) = at_last(frames, Level::new(frames, scale, true), plain.clone(), last, None, &mut advance)?;
-                let growth = level.growth(&state, doubted.frames);
-                (growth < doubted.surely).then_some((level, state, Vec::new(), growth))
-            };
-            match still {
-                Some(still) => still,
-                None => {
-                    let (state, draws, ways) = at_second(&finer, &look, plain, starts, &mut advance)?;
-                    let (level, state) = at_last(frames, finer, state, last, draws, &mut advance)?;
-                    let growth = asked(&level, &state);
-                    (level, state, ways, growth)
-                }
+            break 'found (look.level, look.state, Vec::new(), growth);
+        };
+        let finer = Level::new(frames, scale, true);
+        let mut plain = None;
+        if !doubted.frames.is_empty() {
+            let state = without_draws(&finer, &look, &mut advance)?;
+            let (level, end) = at_last(frames, Level::new(frames, scale, true), state.clone(), last, None, &mut advance)?;
+            let growth = level.growth(&end, doubted.frames);
+            if growth < doubted.surely {
+                break 'found (level, end, Vec::new(), growth);
             }
+            plain = Some(state);
         }
+        let (state, draws, ways) = at_second(&finer, &look, plain, starts, &mut advance)?;
+        let (level, state) = at_last(frames, finer, state, last, draws, &mut advance)?;
+        let growth = asked(&level, &state);
+        (level, state, ways, growth)
     };
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
