@@ -172,7 +172,7 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
-/// Extent in pixels from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard as a pixel show what the
+/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard as a pixel show what the
 /// warps cannot (under one of 1.5 px up to half of it).
 const LONG: f64 = 12.0;
 /// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
@@ -677,7 +677,8 @@ impl Run<'_> {
         for (k, &i) in estimated.iter().enumerate() {
             self.progress(&format!("estimating the blur of {}", frames[i].name), 0.10 + 0.30 * k as f32 / estimated.len() as f32)?;
             let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
-            let (tsf, detail) = self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, &latent)))?;
+            let (tsf, detail) =
+                self.remembered("blur", &own, |_| 0, |run| Ok(run.estimate(i, &latent, |frame, search| frame.estimate(search))))?;
             if tsf.is_none() {
                 self.leave_out(
                     i,
@@ -742,6 +743,7 @@ impl Run<'_> {
         let start = latent.clone();
         let mut solution = None;
         let estimated = if reduced { shaken.clone() } else { estimated };
+        let mut looked_at_twice: Vec<usize> = Vec::new();
         let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
         let mut round = 0;
         while round < rounds && !shaken.is_empty() {
@@ -749,7 +751,7 @@ impl Run<'_> {
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                    let now = format!("{i} {round} {shaken:?}");
+                    let now = format!("{i} {round} {shaken:?} {looked_at_twice:?}");
                     tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
             }
@@ -763,13 +765,13 @@ impl Run<'_> {
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds { for_first_round(&self.settings.deblur) } else { self.settings.deblur.clone() };
-            let now = format!("{round} {shaken:?}");
+            let now = format!("{round} {shaken:?} {looked_at_twice:?}");
             let solved =
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
             let judge = |&i: &usize| {
-                let extent = tsf::extent(tsfs[i].as_ref()?, w, h);
-                Some((i, self.unexplained(i, misfit(i)?, &start, (UNEXPLAINED * LONG / extent).clamp(UNEXPLAINED, 1.0))?))
+                let length = tsf::stroke(tsfs[i].as_ref()?, w, h);
+                Some((i, self.unexplained(i, misfit(i)?, &start, (UNEXPLAINED * LONG / length).clamp(UNEXPLAINED, 1.0))?))
             };
             // TSFs of a smaller size err by pixels of the frame's: they are judged once they have been refined.
             let rough = reduced && round + 1 < rounds;
@@ -780,6 +782,12 @@ impl Run<'_> {
                 round += 1;
                 continue;
             }
+            solution = None;
+            let ids: Vec<usize> = hopeless.iter().map(|h| h.0).filter(|i| !looked_at_twice.contains(i) && !details[*i].is_null()).collect();
+            looked_at_twice.extend(&ids);
+            if self.look_for_slight(&ids, &start, &mut tsfs, &mut details, at(1.0))? {
+                continue;
+            }
             // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
             for (i, chi) in hopeless {
                 let what = if known[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
@@ -787,7 +795,6 @@ impl Run<'_> {
                 shaken.retain(|&k| k != i);
                 all.retain(|&k| k != i);
             }
-            solution = None;
         }
         if shaken.is_empty() && !unexplained {
             self.find_aliasing(&still, &shaken, &latent, 0.80, 0.90)?;
@@ -1062,12 +1069,12 @@ impl Run<'_> {
     }
 
     /// TSF of frame `i` against the sharp irradiance, about where the frame lies, and what is known of it.
-    fn estimate(&self, i: usize, latent: &Rgb) -> (Option<Tsf>, Value) {
+    fn estimate(&self, i: usize, latent: &Rgb, how: impl Fn(&WholeFrame, &Search) -> Option<tsf::Estimate>) -> (Option<Tsf>, Value) {
         let base = self.base(i);
         let luminances = self.luminances(i, latent, &base);
         let frame = luminances.frame(base);
         let search = Search { model: self.settings.model, focal_px: self.settings.focal_px, stop: self.stop.clone() };
-        let Some(found) = frame.estimate(&search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
+        let Some(found) = how(&frame, &search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
         let detail = json!({
             "model": found.model,
             "focal_px": found.tsf.focal_px,
@@ -1079,6 +1086,32 @@ impl Run<'_> {
             "channels": self.looks[i].0.names(),
         });
         (Some(found.tsf), detail)
+    }
+
+    /// Those of the frames `ids` whose blur seems long are looked at once more, as if it were slight: beside lamps far poses answer to what the sharp
+    /// frames lack, and a blur of a pixel or two passes for a long one. Whether any has another TSF now. `start`: irradiance before the frames counted.
+    fn look_for_slight(
+        &mut self,
+        ids: &[usize],
+        start: &Rgb,
+        tsfs: &mut [Option<Tsf>],
+        details: &mut [Value],
+        fraction: f32,
+    ) -> Result<bool> {
+        let (w, h) = self.bracket.size();
+        let mut any = false;
+        for &i in ids {
+            if tsfs[i].as_ref().is_none_or(|t| tsf::extent(t, w, h) <= SLIGHT) {
+                continue;
+            }
+            self.progress(&format!("looking whether the blur of {} is slight", self.bracket.frames()[i].name), fraction)?;
+            let own = format!("slight {i} {:?} {:?}", self.settings.model, self.settings.focal_px);
+            let look = |run: &mut Self| Ok(run.estimate(i, start, |frame, search| frame.estimate_slight(search)));
+            if let (Some(tsf), detail) = self.remembered("blur", &own, |_| 0, look)? {
+                (tsfs[i], details[i], any) = (Some(tsf), detail, true);
+            }
+        }
+        Ok(any)
     }
 
     /// Patches of frame `i` and their PSFs, as the report has them.

@@ -449,7 +449,7 @@ impl Run<'_> {
         let (w, h) = self.bracket.size();
         let mut tsfs: Vec<Option<Tsf>> = vec![None; self.exposures.len()];
         for &i in &moved {
-            tsfs[i] = self.estimate(i, &scene).0;
+            tsfs[i] = self.estimate(i, &scene, |frame, search| frame.estimate(search)).0;
         }
         let blurred = |i: &usize| tsfs[*i].as_ref().is_none_or(|t| tsf::extent(t, w, h) > CONFIRMED);
         let blurred: Vec<usize> = moved.into_iter().filter(blurred).collect();

@@ -10,7 +10,7 @@ use super::model::{Chart, Coordinates, Model};
 use super::whole_frame::{Row, WholeFrame};
 use crate::image::Plane;
 use crate::pose::{Pose, PoseGrid, project};
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -28,6 +28,12 @@ pub struct Search {
 }
 
 impl Search {
+    /// Focal length in pixels of a frame of `w` x `h` pixels, and the model to begin with: pitch and yaw show only at the finest level.
+    fn start(&self, w: usize, h: usize) -> (f64, Model) {
+        let planar = if self.model == Model::Translation { Model::Translation } else { Model::Rigid };
+        (self.focal_px.unwrap_or_else(|| nominal_focal(w, h)), planar)
+    }
+
     fn is_stopped(&self) -> bool {
         self.stop.as_ref().is_some_and(|s| s.load(Ordering::Relaxed))
     }
@@ -127,12 +133,11 @@ impl Level {
 /// Extent in pixels, the largest over corners and centre, of what the TSF does to a point: all but the outermost hundredth of its time on
 /// either side, since a stray pose of next to no weight is not blur.
 pub fn extent(tsf: &Tsf, width: usize, height: usize) -> f64 {
-    let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
-    let span = |mut along: Vec<(f64, f64)>| {
+    let span = |along: &mut Vec<(f64, f64)>| {
         along.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut before = 0.0;
         let (mut lo, mut hi) = (f64::INFINITY, f64::NEG_INFINITY);
-        for (v, w) in along {
+        for &(v, w) in along.iter() {
             if before + w > 0.01 && before < 0.99 {
                 (lo, hi) = (lo.min(v), hi.max(v));
             }
@@ -140,18 +145,41 @@ pub fn extent(tsf: &Tsf, width: usize, height: usize) -> f64 {
         }
         (hi - lo).max(0.0)
     };
+    widest(tsf, (width, height), span)
+}
+
+/// Length in pixels of an even stroke whose standard deviation, the largest over corners and centre, is that of what the TSF does to a point: a few per
+/// cent of its time far away count for less than in [`extent`].
+pub fn stroke(tsf: &Tsf, width: usize, height: usize) -> f64 {
+    let deviation = |along: &mut Vec<(f64, f64)>| {
+        let moment = |f: &dyn Fn(f64) -> f64| along.iter().map(|&(v, w)| f(v) * w).sum::<f64>();
+        let mean = moment(&|v| v);
+        moment(&|v| (v - mean).powi(2)).sqrt()
+    };
+    12f64.sqrt() * widest(tsf, (width, height), deviation)
+}
+
+/// The largest of what `measure` makes of where the poses take the corners and the centre, along x or y, and their weights.
+fn widest(tsf: &Tsf, size: (usize, usize), mut measure: impl FnMut(&mut Vec<(f64, f64)>) -> f64) -> f64 {
     let mut worst = 0.0f64;
-    for (i, j) in [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
-        let p = glam::DVec2::new(i * x, j * y);
-        let moved: Vec<(glam::DVec2, f64)> = tsf.poses.iter().map(|pose| (pose.apply(tsf.focal_px, p), pose.weight)).collect();
-        worst = worst.max(span(moved.iter().map(|m| (m.0.x, m.1)).collect())).max(span(moved.iter().map(|m| (m.0.y, m.1)).collect()));
+    for p in landmarks(size) {
+        let moved: Vec<(DVec2, f64)> = tsf.poses.iter().map(|pose| (pose.apply(tsf.focal_px, p), pose.weight)).collect();
+        worst = worst
+            .max(measure(&mut moved.iter().map(|m| (m.0.x, m.1)).collect()))
+            .max(measure(&mut moved.iter().map(|m| (m.0.y, m.1)).collect()));
     }
     worst
 }
 
+/// Centre and corners, from the centre.
+fn landmarks(size: (usize, usize)) -> [DVec2; 5] {
+    let corner = 0.5 * DVec2::new(size.0 as f64 - 1.0, size.1 as f64 - 1.0);
+    [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(i, j)| DVec2::new(i, j) * corner)
+}
+
 /// Whole pixels u = p - Γ⁻¹ p near which the PSF at the frame's pixel `p` of a `size` frame has its values.
 pub fn path_at(tsf: &Tsf, p: (f64, f64), size: (usize, usize)) -> Vec<(isize, isize)> {
-    let p = glam::DVec2::new(p.0 - (size.0 as f64 - 1.0) / 2.0, p.1 - (size.1 as f64 - 1.0) / 2.0);
+    let p = DVec2::new(p.0 - (size.0 as f64 - 1.0) / 2.0, p.1 - (size.1 as f64 - 1.0) / 2.0);
     let mut path: Vec<(isize, isize)> = tsf
         .poses
         .iter()
@@ -167,15 +195,9 @@ pub fn path_at(tsf: &Tsf, p: (f64, f64), size: (usize, usize)) -> Vec<(isize, is
 
 /// Farthest that any pose takes a corner or the centre, pixels.
 fn reach(tsf: &Tsf, size: (usize, usize)) -> f64 {
-    let (x, y) = (0.5 * (size.0 as f64 - 1.0), 0.5 * (size.1 as f64 - 1.0));
-    let mut worst = 0.0f64;
-    for pose in &tsf.poses {
-        for (i, j) in [(0.0, 0.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
-            let p = glam::DVec2::new(i * x, j * y);
-            worst = worst.max((pose.apply(tsf.focal_px, p) - p).abs().max_element());
-        }
-    }
-    worst
+    let farthest =
+        |pose: &Pose| landmarks(size).map(|p| (pose.apply(tsf.focal_px, p) - p).abs().max_element()).into_iter().fold(0.0, f64::max);
+    tsf.poses.iter().map(farthest).fold(0.0, f64::max)
 }
 
 /// Particles that stand for one continuous pose together: the heaviest take in those within `radius` pixels.
@@ -283,15 +305,15 @@ fn short(frame: &WholeFrame, long: &Tsf, model: Model) -> Option<Tsf> {
     let (inside, judge) = (Evidence::new(frame, &held.inside), Evidence::new(frame, &held.outside));
     let blocks = |tsf: &Tsf| held.blocks(&judge.residual(tsf));
     let long = inside.refine(&gathered(long, &chart)?, &chart, 5);
-    let few = gathered(&inside.weigh(&near(&chart)?, chart.focal, inside.misfit(&long).sqrt())?, &chart)?;
-    let short = inside.refine(&few, &chart, 5);
+    let short = near(&inside, &chart, inside.misfit(&long).sqrt())?;
     Worse::than(&blocks(&short), &blocks(&long)).forgivable().then_some(short)
 }
 
-/// The lattice poses up to [`NEAR`] pixels from where the frame lies.
-fn near(chart: &Chart) -> Option<Vec<Pose>> {
-    let grown = (0..NEAR).try_fold(Tsf::identity(), |t, _| Tsf::new(chart.focal, around(&t, chart, 1.0)));
-    grown.ok().map(|t| t.poses)
+/// A blur of poses up to [`NEAR`] pixels from where the frame lies, where so much `noise` is left.
+fn near(evidence: &Evidence, chart: &Chart, noise: f64) -> Option<Tsf> {
+    let lattice = (0..NEAR).try_fold(Tsf::identity(), |t, _| Tsf::new(chart.focal, around(&t, chart, 1.0))).ok()?;
+    let few = gathered(&evidence.weigh(&lattice.poses, chart.focal, noise)?, chart)?;
+    Some(evidence.refine(&few, chart, 5))
 }
 
 /// The poses of `tsf` that hang together and weigh most.
@@ -326,14 +348,12 @@ impl WholeFrame<'_> {
         let levels = self.levels(count);
         let level = |l: usize| if l == 0 { WholeFrame { ..*self } } else { levels[l - 1].frame() };
 
-        let focal = search.focal_px.unwrap_or_else(|| nominal_focal(w, h));
+        let (focal, planar) = search.start(w, h);
         let coarse = level(count);
         let (cw, ch) = coarse.size();
         let grid = PoseGrid::new(cw, ch, RADIUS.min(cw.min(ch) / 5), DEGREES, 1.0);
         let mut tsf = coarse.fit_grid(&grid, None)?.scaled((1 << count) as f64);
         tsf.focal_px = focal;
-        // Pitch and yaw show only at the finest level.
-        let planar = if search.model == Model::Translation { Model::Translation } else { Model::Rigid };
         let mut l = count;
         loop {
             if search.is_stopped() {
@@ -364,6 +384,19 @@ impl WholeFrame<'_> {
             l -= 1;
         }
         let found = choose(&level(l), l, &tsf, focal, search);
+        Some(Estimate { tsf: found.tsf.about(self.base), ..found })
+    }
+
+    /// TSF of this frame, if that is a slight blur, of a few pixels about where the frame lies; `None` when no such pose explains it better than none.
+    pub fn estimate_slight(&self, search: &Search) -> Option<Estimate> {
+        let (w, h) = self.size();
+        let (focal, planar) = search.start(w, h);
+        let (rows, chart) = (self.rows(ROWS, NEAR + 3), Chart::new(planar, focal, w, h));
+        let evidence = Evidence::new(self, &rows);
+        // What is left without any blur is more than noise: the second time counts what the first leaves.
+        let first = near(&evidence, &chart, evidence.misfit(&Tsf::identity()).sqrt())?;
+        let found = near(&evidence, &chart, evidence.misfit(&first).sqrt())?;
+        let found = choose(self, 0, &found, focal, search);
         Some(Estimate { tsf: found.tsf.about(self.base), ..found })
     }
 

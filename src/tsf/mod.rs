@@ -13,7 +13,7 @@ mod whole_frame;
 pub use align_across::{align_across, blurred};
 pub use align_within::{Within, align_within, psf_at, shifted};
 pub(crate) use estimate::filled;
-pub use estimate::{Estimate, Search, Trial, extent, path_at};
+pub use estimate::{Estimate, Search, Trial, extent, path_at, stroke};
 pub use from_psfs::from_psfs;
 pub use model::Model;
 pub use taps::{INDISTINGUISHABLE, Interpolation, Tap, TapSet, WARP_COST};

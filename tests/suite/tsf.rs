@@ -5,7 +5,7 @@ use glam::{DMat3, DVec2};
 use unshaken::image::Plane;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch};
-use unshaken::tsf::{self, Interpolation, Model, Search, TapSet, Tsf, WholeFrame};
+use unshaken::tsf::{self, Estimate, Interpolation, Model, Search, TapSet, Tsf, WholeFrame};
 
 const SIZE: (usize, usize) = (160, 120);
 const PAD: usize = 16;
@@ -159,6 +159,54 @@ fn lamps_in_a_chain_do_not_widen_the_blur() {
     let expected = tsf::extent(&truth, size.0, size.1);
     assert!(wide < expected + 4.0, "{wide:.1} px, in truth {expected:.1}; operator error {error:.3}");
     assert!(error < 0.08, "operator error {error:.3}");
+}
+
+/// Where little but lamps tells the blur, and the sharp frame shows them otherwise than they are, far poses explain a coarse level as well.
+#[test]
+fn a_slight_blur_beside_lamps_is_found_where_it_is_looked_for() {
+    let (size, pad) = ((256, 160), 24);
+    let (w, h) = (size.0 + 2 * pad, size.1 + 2 * pad);
+    let truth = path(300.0, |t| Pose::planar(1.4 * t, 1.4 * (1.0 - 4.0 * t * t), 0.1 * t, 1.0));
+    let mut mistaken = 0;
+    for (seed, lamps, wrong) in [(2, 8, 0.0), (3, 30, 0.6), (4, 8, 0.3), (6, 30, 0.3), (7, 8, 0.3), (9, 8, 0.0)] {
+        let (mut scene, mut latent) = (Plane::filled(w, h, 0.05), Plane::filled(w, h, 0.05));
+        for lamp in numbers(seed, 3 * lamps).chunks(3) {
+            let lies = DVec2::new((0.5 + f64::from(lamp[0])) * w as f64, (0.5 + f64::from(lamp[1])) * h as f64);
+            let bright = 2.0f32.powf(6.0 * lamp[2]);
+            let seen_as = bright * (1.0 + wrong * (lamp[0] + lamp[1])) / (1.0 + wrong);
+            for j in 0..w * h {
+                let d = (DVec2::new((j % w) as f64, (j / w) as f64) - lies).length_squared();
+                scene.data[j] += bright * (-d / 0.8).exp() as f32;
+                latent.data[j] += seen_as * (-d / (0.8 + f64::from(wrong))).exp() as f32;
+            }
+        }
+        let (blurred, weight) = shaken(&scene, pad, &truth, size);
+        let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
+        let error = |found: &Estimate| operator_error(&scene, pad, &found.tsf, &truth, size);
+        let slight = error(&frame.estimate_slight(&search(Model::Rigid, Some(300.0))).expect("lamps determine it"));
+        let any = error(&frame.estimate(&search(Model::Rigid, Some(300.0))).expect("lamps determine it"));
+        println!("{lamps} lamps (seed {seed}): operator error {slight:.3}, by the general search {any:.3}");
+        assert!(slight < 0.35, "{lamps} lamps (seed {seed}): operator error {slight:.3}, by the general search {any:.3}");
+        mistaken += i32::from(any > 0.6);
+    }
+    assert!(mistaken > 0, "the general search finds all of them: nothing is shown");
+}
+
+#[test]
+fn a_stray_pose_is_part_of_the_extent_and_hardly_of_the_stroke() {
+    let line = path(300.0, |t| Pose::planar(9.0 * t, 0.0, 0.0, 1.0));
+    let measured = |t: &Tsf| (tsf::stroke(t, SIZE.0, SIZE.1), tsf::extent(t, SIZE.0, SIZE.1));
+    let (stroke, extent) = measured(&line);
+    assert!((stroke - 9.0).abs() < 0.01 && (extent - 9.0).abs() < 0.3, "{stroke}, {extent}");
+    let poses = vec![Pose::planar(-0.5, 0.0, 0.0, 0.49), Pose::planar(0.5, 0.0, 0.0, 0.49), Pose::planar(0.0, 8.0, 0.0, 0.02)];
+    let stray = Tsf::new(300.0, poses).unwrap();
+    let (stroke, extent) = measured(&stray);
+    assert!(stroke < 4.0 && extent > 7.9, "{stroke}, {extent}");
+    // A roll moves the corners alone.
+    let roll = path(300.0, |t| Pose::planar(0.0, 0.0, 2.0 * t, 1.0));
+    let corner = 0.5 * (SIZE.0 as f64 - 1.0);
+    let expected = 2f64.to_radians() * corner;
+    assert!((measured(&roll).0 - expected).abs() < 0.01 * expected, "{}, {expected}", measured(&roll).0);
 }
 
 #[test]
