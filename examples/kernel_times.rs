@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let file = TsfFile::parse(&std::fs::read_to_string(path)?)?;
     let gpu = Gpu::new()?;
     println!("{}", gpu.description);
-    for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
+    for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic, Interpolation::SixPoint] {
         let kernels = Kernels::new(&gpu);
         for entry in &file.frames {
             let tsf = Tsf::new(entry.focal_px, entry.poses.clone())?;

@@ -15,8 +15,9 @@
 //! has a part of it only, and what noise that leaves is filtered from the result.
 //!
 //! Residuals far from the solution speak of the start and not of a frame's TSF, so the residual-driven weights begin once
-//! an outer step lowers the objective by less than `settled` of it. The iteration stops when a step under these weights lowers
-//! it by less than `tolerance` of it, or at `outer` steps.
+//! an outer step lowers the objective by less than `settled` of it; at once where sharp frames start from their own merge and still leave far more
+//! than the noise, since they then do not agree about the scene. The conjugate gradients of a step end when ⟨r, z⟩ has
+//! fallen to the part `reduction`, or after `inner` iterations. The iteration stops when a step under these weights lowers the objective by less than `tolerance` of it, or at `outer` steps.
 
 mod aliasing;
 mod memory;
@@ -67,8 +68,10 @@ pub struct Settings {
     pub epsilon: f32,
     /// Outer iterations (weights, Gauss-Newton) at most.
     pub outer: usize,
-    /// Conjugate-gradient iterations of each outer one.
+    /// Conjugate-gradient iterations of each outer one at most.
     pub inner: usize,
+    /// Part of its start to which ⟨r, z⟩ of the conjugate gradients has to fall: the weights of the next outer iteration change more than what is left.
+    pub reduction: f64,
     /// Relative fall of the objective below which the iteration stops.
     pub tolerance: f64,
     /// Strength of the residual-driven weights of blurred frames; 0: none.
@@ -91,6 +94,7 @@ impl Default for Settings {
             epsilon: 0.01,
             outer: 8,
             inner: 16,
+            reduction: 1e-2,
             tolerance: 2e-2,
             robust: 1.0,
             settled: 0.5,
@@ -121,6 +125,8 @@ pub struct Iteration {
     pub after: f64,
     /// Damping s of the step; 0 when none lowered the objective.
     pub step: f32,
+    /// Conjugate-gradient iterations.
+    pub inner: usize,
     /// ⟨r, z⟩ of the conjugate gradients at the end over that at the start.
     pub reduction: f64,
 }
@@ -187,6 +193,9 @@ pub fn pad_for(tsfs: &[&Tsf], width: usize, height: usize, limit: usize) -> usiz
 /// Part of the strength of the residual-driven weights that a displaced sharp frame gets: what its samples between the grid's pixels differ
 /// by is no wrong TSF, and it is the best frame there is on its own pixels.
 const STILL_ROBUST: f32 = 0.3;
+/// Mean squared residual over variance from which sharp frames, at the merge of themselves, do not agree about the scene: what their pixels alias makes some
+/// times the noise, flare and what moved in a photographed night some thousand.
+const DISAGREE: f64 = 300.0;
 /// Least irradiance: the logarithm needs one above 0.
 const DARKEST: f32 = 1e-30;
 /// Part of the time that the iteration takes.
@@ -731,10 +740,10 @@ impl<'a> Solver<'a> {
         Ok(gpu::read(self.gpu, &self.state.scalars, SCALARS)?.into_iter().map(f64::from).collect())
     }
 
-    /// ⟨r, z⟩ of some channels together.
-    fn energy(&self, group: &Range<usize>) -> Result<f64> {
+    /// ⟨r, z⟩ of each channel.
+    fn energies(&self) -> Result<[f64; 3]> {
         let scalars = self.scalars()?;
-        Ok(group.clone().map(|c| scalars[SLOTS * c + SLOT_ENERGY]).sum())
+        Ok(std::array::from_fn(|c| scalars[SLOTS * c + SLOT_ENERGY]))
     }
 
     fn objective(&self) -> Result<f64> {
@@ -756,28 +765,37 @@ impl<'a> Solver<'a> {
         let keep: Vec<Step> = s.irradiance.iter().zip(&s.old).map(|(from, to)| Step::Copy(from.clone(), to.clone())).collect();
         let mut history = Vec::new();
         let mut stop = Stop::IterationLimit;
-        let mut settled = set.robust == 0.0 || set.settled == f64::INFINITY;
+        let mut settled = set.robust == 0.0 || set.settled == f64::INFINITY || self.sharp_frames_disagree(&trusting, &evaluate)?;
         for outer in 0..set.outer {
             if outer == 0 || set.reweight {
                 self.gpu.submit(if settled { &weigh } else { &trusting });
             }
             self.gpu.submit(&edges);
             let (mut energy, mut left) = (0.0, 0.0);
+            // The first channel decides, so that it does not matter how many are solved together.
+            let mut inner = set.inner;
             for (number, (group, start, iteration)) in systems.iter().enumerate() {
                 self.gpu.submit(start);
-                energy += self.energy(group)?;
-                for i in 0..set.inner {
+                let first = self.energies()?;
+                let mut now = first;
+                let mut i = 0;
+                while i < inner {
                     self.gpu.submit(iteration);
-                    // Waiting now and then keeps the queue short and the progress honest; the last one waits below anyway.
-                    if i % 5 == 4 || i + 1 == set.inner {
-                        self.energy(group)?;
-                        let done = (number as f32 + (i + 1) as f32 / set.inner as f32) / systems.len() as f32;
+                    i += 1;
+                    // Waiting now and then keeps the queue short and the progress honest.
+                    if i % 5 == 0 || i == inner {
+                        now = self.energies()?;
+                        let done = (number as f32 + i as f32 / inner as f32) / systems.len() as f32;
                         if !progress(ITERATING * (outer as f32 + done) / set.outer as f32) {
                             return Err(Error::Cancelled);
                         }
+                        if number == 0 && now[0] <= set.reduction * first[0] {
+                            inner = i;
+                        }
                     }
                 }
-                left += self.energy(group)?;
+                energy += first[group.clone()].iter().sum::<f64>();
+                left += now[group.clone()].iter().sum::<f64>();
             }
             let reduction = left / energy.max(f64::MIN_POSITIVE);
             let before = self.objective()?;
@@ -793,7 +811,7 @@ impl<'a> Solver<'a> {
                 }
                 step = if step > 1e-3 { step * 0.5 } else { 0.0 };
             }
-            history.push(Iteration { before, after, step, reduction });
+            history.push(Iteration { before, after, step, inner, reduction });
             if step == 0.0 {
                 stop = Stop::Breakdown;
                 break;
@@ -811,6 +829,19 @@ impl<'a> Solver<'a> {
         }
         let irradiance = self.read(&s.irradiance)?;
         Ok(Solution { irradiance, pad: self.pad, misfit, report: SolveReport { stop, history, chi_squared, memory: self.memory } })
+    }
+
+    /// Whether all frames are sharp, and what they leave unexplained at the start, under the weights `trusting`, is far more than their noise and their pixels
+    /// make; `evaluate`: steps of the objective.
+    fn sharp_frames_disagree(&self, trusting: &[Step], evaluate: &[Step]) -> Result<bool> {
+        if self.moving().count() == 0 || self.moving().any(|m| !m.operator.still) {
+            return Ok(false);
+        }
+        self.gpu.submit(trusting);
+        self.gpu.submit(evaluate);
+        let scalars = self.scalars()?;
+        let data: f64 = (0..3).map(|c| scalars[SLOTS * c + SLOT_DATA]).sum();
+        Ok(2.0 * data > DISAGREE * (3 * self.observed.len() * self.counts().1) as f64)
     }
 
     /// χ² of each frame at the present estimate, as a whole and locally.

@@ -96,7 +96,16 @@ fn start(pad: usize) -> Rgb {
 }
 
 fn settings() -> Settings {
-    Settings { lambda: 2.0, epsilon: 0.05, settled: f64::INFINITY, interpolation: INTERPOLATION, prior: Prior::Tv, ..Settings::default() }
+    let standard = Settings::default();
+    Settings {
+        lambda: 2.0,
+        epsilon: 0.05,
+        settled: f64::INFINITY,
+        reduction: 0.0,
+        interpolation: INTERPOLATION,
+        prior: Prior::Tv,
+        ..standard
+    }
 }
 
 fn run(observations: &[Observation], initial: &Rgb, pad: usize, settings: &Settings) -> Solution {
@@ -397,6 +406,38 @@ fn a_lamp_that_a_shaken_frame_sees_by_the_lobes_of_its_interpolation_alone_does_
     }
     let history = run(&bracket, &initial, pad, &Settings { outer: 3, ..settings() }).report.history;
     assert!(history.len() == 3 && history.iter().all(|i| i.step == 1.0 && i.reduction < 0.02), "{history:?}");
+}
+
+#[test]
+fn the_gradients_end_where_enough_is_gained() {
+    let (bracket, initial) = (bracket(2), start(2));
+    let set = Settings { outer: 1, inner: 60, ..settings() };
+    let whole = run(&bracket, &initial, 2, &set).report.history[0].clone();
+    assert!(whole.inner == 60 && whole.reduction < 1e-6, "{whole:?}");
+    let part = run(&bracket, &initial, 2, &Settings { reduction: 1e-2, ..set }).report.history[0].clone();
+    assert!(part.inner < 60 && part.reduction > whole.reduction && part.reduction < 0.1, "{part:?}");
+    assert!(part.before - part.after > 0.9 * (whole.before - whole.after), "{part:?}, {whole:?}");
+}
+
+#[test]
+fn sharp_frames_that_do_not_agree_are_doubted_from_the_first() {
+    let elsewhere = Tsf::still(DMat3::from_translation(glam::DVec2::new(0.4, -0.3)));
+    let agreeing = [observe(Tsf::identity(), 0.1, 0, 1), observe(elsewhere.clone(), 0.2, 0, 10)];
+    let mut other = observe(elsewhere, 0.2, 0, 10);
+    // What moved into a half of the second frame.
+    other.exposure = other.exposure.map_planes(|p| Plane::from_fn(SIZE.0, SIZE.1, |x, y| if x < 6 { 0.9 } else { p.at(x, y) }));
+    let disagreeing = [observe(Tsf::identity(), 0.1, 0, 1), other];
+    let first = |bracket: &[Observation], robust: f32| {
+        let set = Settings { settled: 0.5, robust, outer: 2, ..settings() };
+        run(bracket, &truth(0), 0, &set).report.history[0].before
+    };
+    assert_eq!(first(&agreeing, 1.0), first(&agreeing, 0.0), "what agrees is trusted at first");
+    let (trusted, doubted) = (first(&disagreeing, 0.0), first(&disagreeing, 1.0));
+    assert!(doubted < 0.3 * trusted, "{doubted} under the weights of frames that disagree, {trusted} without");
+    // Beside a shaken frame it may be the start that is wrong.
+    let [a, b] = disagreeing;
+    let beside = [a, b, observe(shaken(), 0.5, 0, 20)];
+    assert_eq!(first(&beside, 1.0), first(&beside, 0.0));
 }
 
 #[test]
