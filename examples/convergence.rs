@@ -32,8 +32,8 @@ fn main() -> Result<(), Failure> {
     println!("{}", gpu.description);
     let kernels = Kernels::new(&gpu);
     let defaults = Settings { prior: Prior::Tv, ..Settings::default() };
-    let long = Settings { outer: LONG, tolerance: 0.0, ..defaults.clone() };
-    let plain = Settings { outer: 6, inner: 15, tolerance: 0.0, settled: f64::INFINITY, ..defaults.clone() };
+    let long = Settings { outer: LONG, tolerance: 0.0, reduction: 0.0, ..defaults.clone() };
+    let plain = Settings { outer: 6, inner: 15, tolerance: 0.0, reduction: 0.0, settled: f64::INFINITY, ..defaults.clone() };
     let shaken = |extent_px, roll_deg| Some(Tremor { extent_px, roll_deg, offset_px: 1.5, offset_deg: 0.1 });
     let two = [(1.0 / 30.0, None), (1.0 / 8.0, None), (1.0 / 5.0, None), (1.0 / 2.0, shaken(6.0, 0.5)), (2.0, shaken(12.0, 1.0))];
     let all = [(1.0 / 8.0, shaken(6.0, 0.5)), (1.0 / 2.0, shaken(9.0, 0.8)), (2.0, shaken(12.0, 1.0))];
