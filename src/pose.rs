@@ -92,12 +92,13 @@ impl Projection {
     }
 
     /// Whether it needs no division: even steps stay even.
+    #[inline(always)]
     pub fn is_affine(&self) -> bool {
         self.affine
     }
 
     /// Where it takes `p`.
-    #[inline]
+    #[inline(always)]
     pub fn of(&self, p: DVec2) -> DVec2 {
         if self.affine {
             self.h.x_axis.truncate() * p.x + self.h.y_axis.truncate() * p.y + self.h.z_axis.truncate()

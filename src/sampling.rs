@@ -3,14 +3,15 @@
 use crate::image::Plane;
 use glam::DVec2;
 
-/// What `f` returns, with the widest vector instructions that this processor has for its loops: the program is built for the oldest.
+/// What `f` returns, with the widest vector instructions that this processor has for its loops: the program is built for the oldest. Only what is
+/// inlined into it gets them, so `f` and all that it calls in its loops has to be `#[inline(always)]`, and its loops written out: `collect` is not inlined.
 #[inline]
 pub fn wide<R>(f: impl FnOnce() -> R) -> R {
     pulp::Arch::new().dispatch(f)
 }
 
 /// `v` as a whole number that is not greater, and the rest. `f64::floor` is a call of a library function on processors that are not known to round.
-#[inline]
+#[inline(always)]
 pub fn split(v: f64) -> (isize, f32) {
     let towards_zero = v as isize;
     let whole = towards_zero - isize::from(v < towards_zero as f64);
@@ -18,26 +19,26 @@ pub fn split(v: f64) -> (isize, f32) {
 }
 
 /// Weights of the four pixels around fraction `t`.
-#[inline]
+#[inline(always)]
 pub fn weights(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
 /// Their derivatives.
-#[inline]
+#[inline(always)]
 pub fn slopes(t: f32) -> [f32; 4] {
     let t2 = t * t;
     [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)]
 }
 
-#[inline]
+#[inline(always)]
 fn along(w: &[f32; 4], row: &[f32; 4]) -> f32 {
     w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]
 }
 
 /// Calls `f` with each of the four rows of four pixels around pixel (`x`, `y`), the nearest edge pixel outside.
-#[inline]
+#[inline(always)]
 fn rows(plane: &Plane, x: isize, y: isize, mut f: impl FnMut(usize, &[f32; 4])) {
     let (x, y) = (x - 1, y - 1);
     if x >= 0 && y >= 0 && x + 4 <= plane.width as isize && y + 4 <= plane.height as isize {
@@ -54,7 +55,7 @@ fn rows(plane: &Plane, x: isize, y: isize, mut f: impl FnMut(usize, &[f32; 4])) 
 }
 
 /// `plane` at `p` (pixels).
-#[inline]
+#[inline(always)]
 pub fn cubic(plane: &Plane, p: DVec2) -> f32 {
     let ((x, u), (y, v)) = (split(p.x), split(p.y));
     let (wx, wy) = (weights(u), weights(v));
@@ -64,7 +65,7 @@ pub fn cubic(plane: &Plane, p: DVec2) -> f32 {
 }
 
 /// `plane` at `p` (pixels) and its gradient.
-#[inline]
+#[inline(always)]
 pub fn cubic_with_gradient(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
     let ((x, u), (y, v)) = (split(p.x), split(p.y));
     let (wx, wy, sx, sy) = (weights(u), weights(v), slopes(u), slopes(v));

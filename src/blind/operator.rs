@@ -62,7 +62,7 @@ impl Default for Cells {
 impl Cells {
     /// From the coordinates of the first and the last pixel of the block, between which they run evenly where `even`; else from that of each
     /// pixel, `at(k)`, less `slope` k.
-    #[inline]
+    #[inline(always)]
     fn fill(&mut self, first: f64, last: f64, at: impl Fn(usize) -> f64, even: bool, slope: f64) {
         let (from, rest) = split(first);
         self.from = from;
@@ -114,28 +114,22 @@ impl Operator {
     /// K `latent`, on the frame's grid. What lies beyond the latent grid counts as 0.
     pub fn forward(&self, latent: &[f32]) -> Vec<f32> {
         let (w, h) = self.frame;
-        let lw = self.latent().0;
         let mut out = vec![0.0f32; w * h];
         for base in &self.bases {
             let (m, length) = (base.margin, w + 2 * base.margin);
             let mut warped = self.zeros(length * (h + 2 * m));
-            let warp = |j: usize, to: &mut [f32]| {
-                self.walk(base, j, |run| {
-                    let to = &mut to[run.first..][..run.count];
-                    for b in 0..4 {
-                        let from = &latent[run.at + b * lw..][..run.count + 3];
-                        for a in 0..4 {
-                            let weights = run.x[a].iter().zip(run.y[b]);
-                            to.iter_mut().zip(weights).zip(&from[a..]).for_each(|((t, (x, y)), v)| *t += x * y * v);
-                        }
-                    }
-                });
-            };
-            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| wide(|| warp(j, to)));
-            let sum = |y: usize, to: &mut [f32]| {
-                add_taps(to, &warped, &base.taps, |dx, dy| (y + m).strict_add_signed(-dy) * length + m.strict_add_signed(-dx));
-            };
-            out.par_chunks_exact_mut(w).enumerate().for_each(|(y, to)| wide(|| sum(y, to)));
+            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| {
+                wide(
+                    #[inline(always)]
+                    || self.warp_row(base, latent, j, to),
+                );
+            });
+            out.par_chunks_exact_mut(w).enumerate().for_each(|(y, to)| {
+                wide(
+                    #[inline(always)]
+                    || add_taps(to, &warped, &base.taps, |dx, dy| (y + m).strict_add_signed(-dy) * length + m.strict_add_signed(-dx)),
+                );
+            });
             self.done(warped);
         }
         out
@@ -156,25 +150,18 @@ impl Operator {
         let each = |base: &Base| {
             let (m, length) = (base.margin, w + 2 * base.margin);
             let (mut warped, mut out) = (self.zeros(length * (h + 2 * m)), self.zeros(n));
-            let sum = |j: usize, to: &mut [f32]| {
-                let at = |v: usize, d: isize| (v + zeros - m).strict_add_signed(d);
-                add_taps(to, &around, &base.taps, |dx, dy| at(j, dy) * wide_frame + at(0, dx));
-            };
-            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| wide(|| sum(j, to)));
-            let mut spread = |j: usize, from: &[f32]| {
-                self.walk(base, j, |run| {
-                    let from = &from[run.first..][..run.count];
-                    for b in 0..4 {
-                        let to = &mut out[run.at + b * lw..][..run.count + 3];
-                        for a in 0..4 {
-                            let weights = run.x[a].iter().zip(run.y[b]);
-                            to[a..].iter_mut().zip(weights).zip(from).for_each(|((t, (x, y)), v)| *t += x * y * v);
-                        }
-                    }
-                });
-            };
+            let at = |v: usize, d: isize| (v + zeros - m).strict_add_signed(d);
+            warped.par_chunks_exact_mut(length).enumerate().for_each(|(j, to)| {
+                wide(
+                    #[inline(always)]
+                    || add_taps(to, &around, &base.taps, |dx, dy| at(j, dy) * wide_frame + at(0, dx)),
+                );
+            });
             for (j, from) in warped.chunks_exact(length).enumerate() {
-                wide(|| spread(j, from));
+                wide(
+                    #[inline(always)]
+                    || self.spread_row(base, from, j, &mut out),
+                );
             }
             self.done(warped);
             out
@@ -187,6 +174,48 @@ impl Operator {
         }
         self.done(around);
         sum
+    }
+
+    /// Row `j` of a base's array += what the warp sees of `latent`.
+    #[inline(always)]
+    fn warp_row(&self, base: &Base, latent: &[f32], j: usize, row: &mut [f32]) {
+        let lw = self.latent().0;
+        self.walk(
+            base,
+            j,
+            #[inline(always)]
+            |run| {
+                let to = &mut row[run.first..][..run.count];
+                for b in 0..4 {
+                    let from = &latent[run.at + b * lw..][..run.count + 3];
+                    for a in 0..4 {
+                        let weights = run.x[a].iter().zip(run.y[b]);
+                        to.iter_mut().zip(weights).zip(&from[a..]).for_each(|((t, (x, y)), v)| *t += x * y * v);
+                    }
+                }
+            },
+        );
+    }
+
+    /// `latent` += the adjoint of [`Operator::warp_row`] of the row.
+    #[inline(always)]
+    fn spread_row(&self, base: &Base, row: &[f32], j: usize, latent: &mut [f32]) {
+        let lw = self.latent().0;
+        self.walk(
+            base,
+            j,
+            #[inline(always)]
+            |run| {
+                let from = &row[run.first..][..run.count];
+                for b in 0..4 {
+                    let to = &mut latent[run.at + b * lw..][..run.count + 3];
+                    for a in 0..4 {
+                        let weights = run.x[a].iter().zip(run.y[b]);
+                        to[a..].iter_mut().zip(weights).zip(from).for_each(|((t, (x, y)), v)| *t += x * y * v);
+                    }
+                }
+            },
+        );
     }
 
     /// A vector to use until [`Operator::done`]: memory that is fresh from the system costs more than what is done with it.
@@ -202,7 +231,7 @@ impl Operator {
     }
 
     /// Calls `f` with the runs of row `j` of a base's array whose 4 x 4 neighbours the latent grid holds.
-    #[inline]
+    #[inline(always)]
     fn walk(&self, base: &Base, j: usize, mut f: impl FnMut(&Run)) {
         let (w, h) = self.frame;
         let (lw, lh) = (self.latent().0 as isize, self.latent().1 as isize);
@@ -281,7 +310,7 @@ impl Operator {
 const BLOCK: usize = 32;
 
 /// `row` += Σ weight · `from[at(dx, dy)..]` over `taps`.
-#[inline]
+#[inline(always)]
 fn add_taps(row: &mut [f32], from: &[f32], taps: &[Tap], at: impl Fn(isize, isize) -> usize) {
     let (blocks, rest) = row.as_chunks_mut::<BLOCK>();
     let done = blocks.len() * BLOCK;

@@ -46,7 +46,10 @@ impl ActiveSet {
             columns.extend(incoming.iter().map(|&id| column(id)));
             ids.extend(&incoming);
             h.resize(ids.len(), 0.0);
-            let products = wide(|| products(&columns, first));
+            let products = wide(
+                #[inline(always)]
+                || products(&columns, first),
+            );
             for (i, row) in gram.iter_mut().enumerate() {
                 row.extend(products.iter().map(|p| p[i]));
             }
@@ -120,7 +123,7 @@ fn retain<T>(v: &mut Vec<T>, keep: &[bool]) {
 
 /// Inner products of each of `columns` from the one numbered `first` on with all of them. In blocks of rows, so that what the processor's caches
 /// hold is used for all pairs.
-#[inline]
+#[inline(always)]
 fn products(columns: &[Vec<f32>], first: usize) -> Vec<Vec<f64>> {
     let new = &columns[first..];
     let mut sums = vec![vec![0.0f64; columns.len()]; new.len()];
@@ -139,7 +142,7 @@ fn products(columns: &[Vec<f32>], first: usize) -> Vec<Vec<f64>> {
 const ROWS: usize = 1024;
 
 /// Inner product with a few f32 lanes per f64 sum: fast, and exact enough for a Gram matrix of 10⁵ rows.
-#[inline]
+#[inline(always)]
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.chunks(64)
         .zip(b.chunks(64))

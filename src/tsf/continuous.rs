@@ -72,7 +72,15 @@ impl<'a> Evidence<'a> {
     fn column(&self, pose: &Pose, focal: f64) -> Vec<f32> {
         let turn = Projection::new(self.back * pose.rotation(focal).inverse());
         let t = DVec2::new(pose.t_x, pose.t_y);
-        let v: Vec<f32> = wide(|| self.pixels.iter().map(|q| cubic(self.latent, turn.of(*q - t) + self.origin)).collect());
+        let mut v = vec![0.0; self.pixels.len()];
+        wide(
+            #[inline(always)]
+            || {
+                for (v, q) in v.iter_mut().zip(&self.pixels) {
+                    *v = cubic(self.latent, turn.of(*q - t) + self.origin);
+                }
+            },
+        );
         self.rows.iter().map(|&(a, b, k)| k * (v[b as usize] - v[a as usize])).collect()
     }
 
@@ -240,14 +248,23 @@ impl<'a> Evidence<'a> {
         let (turn, inverse) = (Projection::new(self.back * inverse), Projection::new(inverse));
         let base = linear_part(&self.back);
         let t = DVec2::new(pose.t_x, pose.t_y);
-        let one = |q: &DVec2| {
-            let (v, g) = cubic_with_gradient(self.latent, turn.of(*q - t) + self.origin);
-            let g = DVec2::new(f64::from(g[0]), f64::from(g[1]));
-            let (gx, gy) = (g.dot(base[0]), g.dot(base[1]));
-            // Where the pose moves to, the point that a pixel looks at moves away from.
-            (v, chart.motion(inverse.of(*q - t)).map(|m| (-(gx * m.x + gy * m.y)) as f32))
-        };
-        wide(|| self.pixels.iter().map(one).unzip())
+        let (mut values, mut slopes) = (vec![0.0; self.pixels.len()], vec![[0.0; 5]; self.pixels.len()]);
+        wide(
+            #[inline(always)]
+            || {
+                for ((value, slope), q) in values.iter_mut().zip(&mut slopes).zip(&self.pixels) {
+                    let (v, g) = cubic_with_gradient(self.latent, turn.of(*q - t) + self.origin);
+                    let g = DVec2::new(f64::from(g[0]), f64::from(g[1]));
+                    let (gx, gy) = (g.dot(base[0]), g.dot(base[1]));
+                    *value = v;
+                    // Where the pose moves to, the point that a pixel looks at moves away from.
+                    for (s, m) in slope.iter_mut().zip(chart.motion(inverse.of(*q - t))) {
+                        *s = (-(gx * m.x + gy * m.y)) as f32;
+                    }
+                }
+            },
+        );
+        (values, slopes)
     }
 }
 

@@ -106,6 +106,7 @@ impl Chart {
     /// How the frame point `p` (centred) moves per unit of each coordinate, first order in the angles, which are a few degrees.
     ///
     /// Yaw b moves it by `(b F + b x²/F, b x y/F)`, pitch a by `(-a x y/F, -a F - a y²/F)`.
+    #[inline(always)]
     pub fn motion(&self, p: DVec2) -> [DVec2; 5] {
         let roll = DVec2::new(-p.y, p.x) / self.corner;
         if self.model == Model::Rotation {
