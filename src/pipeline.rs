@@ -172,8 +172,8 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Beyond, its blur must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 const UNEXPLAINED: f64 = 0.25;
-/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard as a pixel show what the
-/// warps cannot (under one of 1.5 px up to half of it).
+/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
+/// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
 const LONG: f64 = 12.0;
 /// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
 const SLIGHT: f64 = 4.0;
@@ -491,10 +491,15 @@ impl Run<'_> {
             },
         )?;
         if let Some(noise) = noise {
-            self.curves = noise::curves(frames, self.response, &noise);
-            self.noise = noise;
+            self.take_noise(noise);
         }
         Ok(())
+    }
+
+    /// `noise` as the noise level of the frames, from here on.
+    fn take_noise(&mut self, noise: NoiseModel) {
+        self.curves = noise::curves(self.bracket.frames(), self.response, &noise);
+        self.noise = noise;
     }
 
     /// Motions from the frame `reference` instead.
@@ -707,8 +712,7 @@ impl Run<'_> {
             if let Some(SetFree::Beside(stood)) = found {
                 // Once more from these alone, without what was found beside the others.
                 self.memo.depends(&stood);
-                self.noise = noise;
-                self.curves = noise::curves(frames, self.response, &noise);
+                self.take_noise(noise);
                 for &i in &all {
                     (sharp[i], tsfs[i]) = (stood.contains(&i), None);
                 }

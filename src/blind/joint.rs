@@ -528,9 +528,8 @@ fn without_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> b
 
 /// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
 /// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
-/// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if
-/// that is known. What the best way found, with the draws that it goes on
-/// with, and all ways, the best first. `None` as for [`at_coarsest`].
+/// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if that is known. What the best way found,
+/// with the draws that it goes on with, and all ways, the best first. `None` as for [`at_coarsest`].
 fn at_second(
     finer: &Level,
     look: &Look,

@@ -15,9 +15,10 @@
 //! has a part of it only, and what noise that leaves is filtered from the result.
 //!
 //! Residuals far from the solution speak of the start and not of a frame's TSF, so the residual-driven weights begin once
-//! an outer step lowers the objective by less than `settled` of it; at once where sharp frames start from their own merge and still leave far more
-//! than the noise, since they then do not agree about the scene. The conjugate gradients of a step end when ⟨r, z⟩ has
-//! fallen to the part `reduction`, or after `inner` iterations. The iteration stops when a step under these weights lowers the objective by less than `tolerance` of it, or at `outer` steps.
+//! an outer step lowers the objective by less than `settled` of it; at once where sharp frames start from their own merge and
+//! still leave far more than the noise, since they then do not agree about the scene. The conjugate gradients of a step end when
+//! ⟨r, z⟩ has fallen to the part `reduction`, or after `inner` iterations. The iteration stops when a step under the
+//! residual-driven weights lowers the objective by less than `tolerance` of it, or at `outer` steps.
 
 mod aliasing;
 mod memory;
@@ -323,6 +324,11 @@ fn check(observations: &[Observation], initial: &Rgb) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// The scalar `slot` of each channel.
+fn each_channel(scalars: &[f64], slot: usize) -> [f64; 3] {
+    std::array::from_fn(|c| scalars[SLOTS * c + slot])
 }
 
 /// The operators of a bracket and what they and the iteration keep.
@@ -742,13 +748,12 @@ impl<'a> Solver<'a> {
 
     /// ⟨r, z⟩ of each channel.
     fn energies(&self) -> Result<[f64; 3]> {
-        let scalars = self.scalars()?;
-        Ok(std::array::from_fn(|c| scalars[SLOTS * c + SLOT_ENERGY]))
+        Ok(each_channel(&self.scalars()?, SLOT_ENERGY))
     }
 
     fn objective(&self) -> Result<f64> {
         let scalars = self.scalars()?;
-        Ok((0..3).map(|c| scalars[SLOTS * c + SLOT_DATA]).sum::<f64>() + scalars[SLOT_SMOOTHNESS])
+        Ok(each_channel(&scalars, SLOT_DATA).iter().sum::<f64>() + scalars[SLOT_SMOOTHNESS])
     }
 
     fn run(&self, progress: &mut dyn FnMut(f32) -> bool) -> Result<Solution> {
@@ -839,8 +844,7 @@ impl<'a> Solver<'a> {
         }
         self.gpu.submit(trusting);
         self.gpu.submit(evaluate);
-        let scalars = self.scalars()?;
-        let data: f64 = (0..3).map(|c| scalars[SLOTS * c + SLOT_DATA]).sum();
+        let data: f64 = each_channel(&self.scalars()?, SLOT_DATA).iter().sum();
         Ok(2.0 * data > DISAGREE * (3 * self.observed.len() * self.counts().1) as f64)
     }
 
