@@ -5,6 +5,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64;
 
 /// A reproducible source of random numbers.
+#[derive(Clone)]
 pub struct Random(Pcg64);
 
 impl Random {

@@ -53,6 +53,8 @@ pub enum Draws {
     Finer,
     /// At all.
     All,
+    /// As the best of these, then over some rounds more, whose TSFs are averaged.
+    Averaged,
 }
 
 /// A way to the second level, and how it did there.
@@ -107,6 +109,12 @@ pub struct Start {
 const COARSEST: usize = 250;
 /// Rounds of luminance and TSFs at the coarsest level, at the next, and at finer ones, where little is left to be found and a round is dear.
 const ROUNDS: (usize, usize, usize) = (12, 5, 2);
+/// Those at the second level with draws, where the best way is all that they have to tell.
+const CHOSEN: usize = 3;
+/// Rounds that the best way to the second level goes on there, each with a scene drawn for it, and whose TSFs are averaged: what a scene has by
+/// chance is in the TSFs that are fitted to it as well (B. Delyon, M. Lavielle and E. Moulines, "Convergence of a stochastic approximation version of
+/// the EM algorithm", Annals of Statistics 27, 1999).
+const AVERAGED: usize = 6;
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
 /// Rounds of those at the coarsest level before smoothness falls.
@@ -308,6 +316,25 @@ impl Level {
         let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, latent, Some(t), model_error));
         let fits: Vec<Option<Tsf>> = fits.collect();
         state.take(fits);
+    }
+
+    /// `state` after `rounds` more rounds with draws, the TSFs of each frame the mean over them. `None` as for [`at_coarsest`].
+    fn averaged(&self, state: &State, rounds: usize, draws: &mut Random, going: &mut dyn FnMut() -> bool) -> Option<State> {
+        let mut last = state.clone();
+        let mut poses: Vec<Vec<Pose>> = vec![Vec::new(); last.tsfs.len()];
+        for _ in 0..rounds {
+            self.round(&mut last, 1.0, MODEL_ERROR.1, Some(draws));
+            if !going() {
+                return None;
+            }
+            for (all, tsf) in poses.iter_mut().zip(&last.tsfs) {
+                all.extend(tsf.poses.iter().map(|p| Pose { weight: p.weight / rounds as f64, ..*p }));
+            }
+        }
+        let tsfs = last.tsfs.into_iter().zip(poses).map(|(t, poses)| Tsf { poses, ..t }).collect();
+        let mut mean = State { tsfs, ..last };
+        self.settle(&mut mean);
+        Some(mean)
     }
 
     /// `state` if the frames `still` had not moved: each as far as its mean pose went, and those and the other frames' TSFs follow.
@@ -529,12 +556,13 @@ fn without_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> b
 /// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
 /// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
 /// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if that is known. What the best way found,
-/// with the draws that it goes on with, and all ways, the best first. `None` as for [`at_coarsest`].
+/// with the draws that it goes on with, and all ways, the best first. Those with draws take `rounds` there. `None` as for [`at_coarsest`].
 fn at_second(
     finer: &Level,
     look: &Look,
     plain: Option<State>,
     starts: &[Start],
+    rounds: usize,
     advance: &mut dyn FnMut(usize) -> bool,
 ) -> Option<(State, Option<Random>, Vec<Way>)> {
     let Look { level, state } = look;
@@ -545,7 +573,7 @@ fn at_second(
         None => without_draws(finer, look, advance)?,
     };
     let mut second =
-        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
+        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, rounds, Some(random), &mut || advance(finer.scale));
     let mut from_second = Random::new(SEED, 1);
     let finer_drawn = second(state, &mut from_second)?;
     let all_drawn = second(&drawn, &mut random)?;
@@ -584,6 +612,8 @@ pub struct Doubted<'a> {
     pub frames: &'a [usize],
     /// Growth of the residuals, if they are held, up to which they surely stood still: nothing is to be drawn then.
     pub surely: f64,
+    /// The same up to which they stood still: nothing is to be averaged then.
+    pub at_most: f64,
 }
 
 /// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`; `look` where one at these frames from these starts was
@@ -601,11 +631,12 @@ pub fn estimate(
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     let next = (first > last).then_some(first / 2);
     let search = cost(first, ROUNDS.0 * starts.len());
-    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + 3.0 * cost(s, ROUNDS.1));
+    let (drawn, ends) = if doubted.frames.is_empty() { (CHOSEN, 1.0) } else { (ROUNDS.1, 3.0) };
+    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + cost(s, ROUNDS.1 + 2 * drawn + AVERAGED));
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += cost(s, ROUNDS.2) * if doubted.frames.is_empty() { 1.0 } else { 2.0 };
+        total += ends * cost(s, ROUNDS.2);
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -617,7 +648,8 @@ pub fn estimate(
         Some(look) => look,
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
-    let asked = |level: &Level, state: &State| if doubted.frames.is_empty() { 1.0 } else { level.growth(state, doubted.frames) };
+    let in_doubt = !doubted.frames.is_empty();
+    let asked = |level: &Level, state: &State| if in_doubt { level.growth(state, doubted.frames) } else { 1.0 };
     let (level, state, ways, if_still) = 'found: {
         let Some(scale) = next else {
             let growth = asked(&look.level, &look.state);
@@ -625,7 +657,7 @@ pub fn estimate(
         };
         let finer = Level::new(frames, scale, true);
         let mut plain = None;
-        if !doubted.frames.is_empty() {
+        if in_doubt {
             let state = without_draws(&finer, &look, &mut advance)?;
             let (level, end) = at_last(frames, Level::new(frames, scale, true), state.clone(), last, None, &mut advance)?;
             let growth = level.growth(&end, doubted.frames);
@@ -634,9 +666,22 @@ pub fn estimate(
             }
             plain = Some(state);
         }
-        let (state, draws, ways) = at_second(&finer, &look, plain, starts, &mut advance)?;
+        let (state, draws, mut ways) = at_second(&finer, &look, plain, starts, drawn, &mut advance)?;
+        let mut growth = 1.0;
+        if in_doubt {
+            let (level, end) = at_last(frames, Level::new(frames, scale, true), state.clone(), last, draws.clone(), &mut advance)?;
+            growth = asked(&level, &end);
+            if growth < doubted.at_most {
+                break 'found (level, end, ways, growth);
+            }
+        }
+        let mut random = Random::new(SEED, 3);
+        let mean = finer.averaged(&state, AVERAGED, &mut random, &mut || advance(scale))?;
+        let held_out = geometric_mean(&finer.judge(&mean));
+        let (state, draws) = if held_out < ways[0].held_out { (mean, Some(random)) } else { (state, draws) };
+        ways.push(Way { draws: Draws::Averaged, held_out });
+        ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
         let (level, state) = at_last(frames, finer, state, last, draws, &mut advance)?;
-        let growth = asked(&level, &state);
         (level, state, ways, growth)
     };
     let held_out = level.judge(&state);

@@ -621,8 +621,8 @@ impl Run<'_> {
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
         let places = places(asked, used);
-        let surely = doubt.map_or(0.0, |doubt| 1.0 + SURELY * (doubt.most_growth(asked) - 1.0));
-        let doubted = Doubted { frames: &places, surely };
+        let at_most = doubt.map_or(0.0, |doubt| doubt.most_growth(asked));
+        let doubted = Doubted { frames: &places, surely: 1.0 + SURELY * (at_most - 1.0), at_most };
         let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
