@@ -758,9 +758,16 @@ impl Run<'_> {
                     let now = format!("{i} {round} {shaken:?} {looked_at_twice:?}");
                     tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
+                let now = format!("{round} {shaken:?} {looked_at_twice:?}");
+                tsfs = self.remembered(
+                    "cross-validation",
+                    &now,
+                    |_| 0,
+                    |run| run.cross_validated(&all, &still, &tsfs, &latent, reference, (at(0.05), at(0.2))),
+                )?;
             }
             if round + 1 == rounds {
-                self.find_aliasing(&still, &shaken, &latent, at(0.1), at(0.3))?;
+                self.find_aliasing(&still, &shaken, &latent, at(0.2), at(0.3))?;
             }
             let pad = self.pad(all.iter().filter_map(|&i| tsfs[i].as_ref()));
             let from = match solution.as_ref().or(base.as_ref()) {

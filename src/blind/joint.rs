@@ -7,7 +7,7 @@ use crate::mask;
 use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
 use crate::random::Random;
-use crate::tsf::{self, Tsf, WholeFrame};
+use crate::tsf::{self, Latent, Stride, Tsf, WholeFrame};
 use glam::DMat3;
 use nalgebra::Matrix2;
 use rayon::prelude::*;
@@ -53,8 +53,8 @@ pub enum Draws {
     Finer,
     /// At all.
     All,
-    /// As the best of these, then over some rounds more, whose TSFs are averaged.
-    Averaged,
+    /// As the best of these, and on by cross-validation.
+    Validated,
 }
 
 /// A way to the second level, and how it did there.
@@ -109,12 +109,16 @@ pub struct Start {
 const COARSEST: usize = 250;
 /// Rounds of luminance and TSFs at the coarsest level, at the next, and at finer ones, where little is left to be found and a round is dear.
 const ROUNDS: (usize, usize, usize) = (12, 5, 2);
-/// Those at the second level with draws, where the best way is all that they have to tell.
-const CHOSEN: usize = 3;
-/// Rounds that the best way to the second level goes on there, each with a scene drawn for it, and whose TSFs are averaged: what a scene has by
-/// chance is in the TSFs that are fitted to it as well (B. Delyon, M. Lavielle and E. Moulines, "Convergence of a stochastic approximation version of
-/// the EM algorithm", Annals of Statistics 27, 1999).
-const AVERAGED: usize = 6;
+/// Parts of the pixels that are held out in turn where TSFs are cross-validated.
+const FOLDS: usize = 5;
+/// Steps of that at the level where all blurs are found, at finer ones, and beside sharp frames; iterations of the solves of each.
+const STEPS: (usize, usize, usize) = (30, 10, 20);
+const SOLVED: usize = 15;
+/// Part of the mean over the last steps that an older one keeps: each sees a part of the pixels alone.
+const OLDER: f64 = 0.8;
+/// Growth of the residuals of a part from which the last step was too long: since it was last held out, and the first time, over the least of the others.
+const ROSE: f64 = 1.1;
+const FIRST_ROSE: f64 = 1.5;
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
 /// Rounds of those at the coarsest level before smoothness falls.
@@ -233,6 +237,7 @@ fn known(frames: &[Frame], radius: usize) -> Vec<bool> {
 }
 
 /// One level of the pyramid.
+#[derive(Clone)]
 struct Level {
     scale: usize,
     frames: Vec<Frame>,
@@ -255,13 +260,18 @@ struct State {
 }
 
 impl State {
-    /// Takes the TSFs that were found, and fixes the free warp.
-    fn take(&mut self, fits: Vec<Option<Tsf>>) {
+    /// Takes the TSFs that were found.
+    fn replace(&mut self, fits: Vec<Option<Tsf>>) {
         for (tsf, fit) in self.tsfs.iter_mut().zip(fits) {
             if let Some(fit) = fit {
                 *tsf = fit;
             }
         }
+    }
+
+    /// The same, and fixes the free warp.
+    fn take(&mut self, fits: Vec<Option<Tsf>>) {
+        self.replace(fits);
         let m = fix_warp(&mut self.tsfs, self.reference);
         self.latent = warp(&self.latent, &m);
     }
@@ -318,23 +328,69 @@ impl Level {
         state.take(fits);
     }
 
-    /// `state` after `rounds` more rounds with draws, the TSFs of each frame the mean over them. `None` as for [`at_coarsest`].
-    fn averaged(&self, state: &State, rounds: usize, draws: &mut Random, going: &mut dyn FnMut() -> bool) -> Option<State> {
-        let mut last = state.clone();
-        let mut poses: Vec<Vec<Pose>> = vec![Vec::new(); last.tsfs.len()];
-        for _ in 0..rounds {
-            self.round(&mut last, 1.0, MODEL_ERROR.1, Some(draws));
+    /// `state` after so many `steps` of cross-validation: pixels held out in turn are explained better and better by the luminance that is solved
+    /// from the others. The frames `still` do not move. `None` as for [`at_coarsest`].
+    fn validated(&self, state: &State, still: &[usize], steps: usize, going: &mut dyn FnMut() -> bool) -> Option<State> {
+        let (w, n) = (self.size.0, self.held.len());
+        let effort = Effort { lambda: LAMBDA, outer: 1, inner: SOLVED, model_error: MODEL_ERROR.1 };
+        let moves: Vec<bool> = (0..state.tsfs.len()).map(|k| !still.contains(&k)).collect();
+        let mut now = state.clone();
+        for (tsf, _) in now.tsfs.iter_mut().zip(&moves).filter(|(_, moves)| **moves) {
+            *tsf = tsf::divided(tsf, self.size);
+        }
+        let mut strides = self.strides();
+        let mut mean = now.clone();
+        // Where the last step began, the residuals of each part when it was last held out, and the least of all.
+        let mut left = (now.clone(), mean.clone());
+        let (mut last, mut least) = ([None; FOLDS], f64::INFINITY);
+        for k in 0..steps {
             if !going() {
                 return None;
             }
-            for (all, tsf) in poses.iter_mut().zip(&last.tsfs) {
-                all.extend(tsf.poses.iter().map(|p| Pose { weight: p.weight / rounds as f64, ..*p }));
+            let fold: Vec<bool> = (0..n).map(|p| (p % w * 2 + p / w) % FOLDS == k % FOLDS && self.known[p] && !self.held[p]).collect();
+            let held: Vec<bool> = fold.iter().zip(&self.held).map(|(f, h)| *f || *h).collect();
+            let operators = operators(&now.tsfs, self.size, self.pad);
+            now.latent = luminance::solve(&self.frames, &operators, &now.latent, &held, &effort);
+            let found = luminance::cross_validated(&self.frames, &operators, &now.latent, (&held, &fold), &effort);
+            // What one part has left says little about another.
+            let most = last[k % FOLDS].map_or(FIRST_ROSE * least, |before| ROSE * before);
+            if found.misfit > most {
+                (now, mean) = left.clone();
+                strides.iter_mut().for_each(Stride::shorten);
+                continue;
             }
+            last[k % FOLDS] = Some(found.misfit);
+            least = least.min(found.misfit);
+            left = (now.clone(), mean.clone());
+            let latent = Latent { irradiance: &now.latent, sensitivity: &found.sensitivity, pad: self.pad };
+            let frames = found.unseen.iter().zip(&now.tsfs).zip(&mut strides).zip(&moves);
+            let stepped = frames.map(|(((unseen, tsf), stride), moves)| moves.then(|| unseen.step(&latent, tsf, stride)));
+            let stepped = stepped.collect();
+            if still.is_empty() {
+                now.take(stepped);
+            } else {
+                // Those that do not move say where the scene is.
+                now.replace(stepped);
+            }
+            for (mean, tsf) in mean.tsfs.iter_mut().zip(&now.tsfs) {
+                mean.move_towards(tsf, 1.0 - OLDER);
+            }
+            mean.latent.clone_from(&now.latent);
         }
-        let tsfs = last.tsfs.into_iter().zip(poses).map(|(t, poses)| Tsf { poses, ..t }).collect();
-        let mut mean = State { tsfs, ..last };
         self.settle(&mut mean);
         Some(mean)
+    }
+
+    /// First strides: a Hessian of one frame alone knows nothing of how the luminance follows it, and with that the residuals of all others. The part that a
+    /// frame has of all that is measured is how much of the luminance follows it at most.
+    fn strides(&self) -> Vec<Stride> {
+        let energy = |f: &Frame| -> f64 {
+            let local = gradient_level(&f.blurred, 4);
+            self.weight(f, MODEL_ERROR.1).data.iter().zip(&local.data).map(|(w, g)| f64::from(w * g * g)).sum()
+        };
+        let energies: Vec<f64> = self.frames.iter().map(energy).collect();
+        let all: f64 = energies.iter().sum();
+        energies.iter().map(|e| Stride::new(if all > 0.0 { e / all } else { 1.0 })).collect()
     }
 
     /// `state` if the frames `still` had not moved: each as far as its mean pose went, and those and the other frames' TSFs follow.
@@ -556,13 +612,12 @@ fn without_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> b
 /// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
 /// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
 /// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if that is known. What the best way found,
-/// with the draws that it goes on with, and all ways, the best first. Those with draws take `rounds` there. `None` as for [`at_coarsest`].
+/// with the draws that it goes on with, and all ways, the best first. `None` as for [`at_coarsest`].
 fn at_second(
     finer: &Level,
     look: &Look,
     plain: Option<State>,
     starts: &[Start],
-    rounds: usize,
     advance: &mut dyn FnMut(usize) -> bool,
 ) -> Option<(State, Option<Random>, Vec<Way>)> {
     let Look { level, state } = look;
@@ -573,7 +628,7 @@ fn at_second(
         None => without_draws(finer, look, advance)?,
     };
     let mut second =
-        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, rounds, Some(random), &mut || advance(finer.scale));
+        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
     let mut from_second = Random::new(SEED, 1);
     let finer_drawn = second(state, &mut from_second)?;
     let all_drawn = second(&drawn, &mut random)?;
@@ -630,13 +685,13 @@ pub fn estimate(
     let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     let next = (first > last).then_some(first / 2);
+    let in_doubt = !doubted.frames.is_empty();
     let search = cost(first, ROUNDS.0 * starts.len());
-    let (drawn, ends) = if doubted.frames.is_empty() { (CHOSEN, 1.0) } else { (ROUNDS.1, 3.0) };
-    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + cost(s, ROUNDS.1 + 2 * drawn + AVERAGED));
+    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + cost(s, 3 * ROUNDS.1 + STEPS.0));
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += ends * cost(s, ROUNDS.2);
+        total += if in_doubt { 2.0 * cost(s, ROUNDS.2) } else { 0.0 } + cost(s, STEPS.1);
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -648,41 +703,52 @@ pub fn estimate(
         Some(look) => look,
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
-    let in_doubt = !doubted.frames.is_empty();
-    let asked = |level: &Level, state: &State| if in_doubt { level.growth(state, doubted.frames) } else { 1.0 };
+    // What `state` of the level `finer` comes to at the last one, and by how much its residuals grow if the frames in doubt are held there.
+    let asked = |finer: &Level, state: &State, draws: Option<&Random>, advance: &mut dyn FnMut(usize) -> bool| {
+        let (level, end) = at_last(frames, finer.clone(), state.clone(), last, draws.cloned(), advance)?;
+        let growth = level.growth(&end, doubted.frames);
+        Some((level, end, growth))
+    };
     let (level, state, ways, if_still) = 'found: {
         let Some(scale) = next else {
-            let growth = asked(&look.level, &look.state);
+            let growth = if in_doubt { look.level.growth(&look.state, doubted.frames) } else { 1.0 };
             break 'found (look.level, look.state, Vec::new(), growth);
         };
-        let finer = Level::new(frames, scale, true);
+        let mut level = Level::new(frames, scale, true);
         let mut plain = None;
         if in_doubt {
-            let state = without_draws(&finer, &look, &mut advance)?;
-            let (level, end) = at_last(frames, Level::new(frames, scale, true), state.clone(), last, None, &mut advance)?;
-            let growth = level.growth(&end, doubted.frames);
+            let state = without_draws(&level, &look, &mut advance)?;
+            let (level, end, growth) = asked(&level, &state, None, &mut advance)?;
             if growth < doubted.surely {
                 break 'found (level, end, Vec::new(), growth);
             }
             plain = Some(state);
         }
-        let (state, draws, mut ways) = at_second(&finer, &look, plain, starts, drawn, &mut advance)?;
-        let mut growth = 1.0;
+        let (state, draws, mut ways) = at_second(&level, &look, plain, starts, &mut advance)?;
+        let mut if_still = 1.0;
         if in_doubt {
-            let (level, end) = at_last(frames, Level::new(frames, scale, true), state.clone(), last, draws.clone(), &mut advance)?;
-            growth = asked(&level, &end);
+            let (level, end, growth) = asked(&level, &state, draws.as_ref(), &mut advance)?;
             if growth < doubted.at_most {
                 break 'found (level, end, ways, growth);
             }
+            if_still = growth;
         }
-        let mut random = Random::new(SEED, 3);
-        let mean = finer.averaged(&state, AVERAGED, &mut random, &mut || advance(scale))?;
-        let held_out = geometric_mean(&finer.judge(&mean));
-        let (state, draws) = if held_out < ways[0].held_out { (mean, Some(random)) } else { (state, draws) };
-        ways.push(Way { draws: Draws::Averaged, held_out });
+        let mut validated = level.validated(&state, &[], STEPS.0, &mut || advance(scale))?;
+        let held_out = geometric_mean(&level.judge(&validated));
+        ways.push(Way { draws: Draws::Validated, held_out });
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
-        let (level, state) = at_last(frames, finer, state, last, draws, &mut advance)?;
-        (level, state, ways, growth)
+        if ways[0].draws != Draws::Validated {
+            let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
+            break 'found (level, state, ways, if_still);
+        }
+        while level.scale > last {
+            let finer = Level::new(frames, level.scale / 2, true);
+            let mut state = finer.refine(validated, &level);
+            finer.solve(&mut state, SMOOTHNESS.1, MODEL_ERROR.1, 3);
+            validated = finer.validated(&state, &[], STEPS.1, &mut || advance(finer.scale))?;
+            level = finer;
+        }
+        (level, validated, ways, if_still)
     };
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
@@ -696,6 +762,28 @@ pub fn estimate(
 /// Whether frames of this size are worked on as they are, not at a smaller one.
 pub fn fits(size: (usize, usize)) -> bool {
     size.0 * size.1 <= LARGEST
+}
+
+/// TSFs of `frames`, one each, from those that were found, `tsfs`, and the scene under these, `latent`, so that pixels held out in turn are explained better; as they
+/// were where none are. The frames `still` keep theirs. `None` where `progress` returns `false`.
+pub fn cross_validated(
+    frames: &[Frame],
+    latent: &Plane,
+    tsfs: &[Tsf],
+    still: &[usize],
+    reference: usize,
+    progress: &mut dyn FnMut(Stage) -> bool,
+) -> Option<Vec<Tsf>> {
+    let level = Level::new(frames, 1, true);
+    let mut state = level.placed(latent, tsfs, reference);
+    level.settle(&mut state);
+    let mut done = 0;
+    let found = level.validated(&state, still, STEPS.2, &mut || {
+        done += 1;
+        progress(Stage { scale: 1, fraction: done as f32 / STEPS.2 as f32 })
+    })?;
+    let residual = |state: &State| geometric_mean(&level.judge(state));
+    Some(if residual(&found) < residual(&state) { found.tsfs } else { tsfs.to_vec() })
 }
 
 /// See [`Freed::unlike`], of blurs with the covariances `spreads`.

@@ -8,7 +8,7 @@
 use super::operator::Operator;
 use crate::image::{Channels, Plane, Rgb};
 use crate::random::Random;
-use crate::tsf::Tsf;
+use crate::tsf::{Tsf, Unseen};
 
 /// One frame's luminance at one size.
 #[derive(Clone, Debug)]
@@ -38,6 +38,9 @@ pub struct Effort {
 
 /// Differences of log luminance below this are smoothed quadratically.
 const EPSILON: f32 = 0.01;
+
+/// Residuals of unseen pixels, in standard deviations, from which their absolute value counts and not their square.
+const OUTLYING: f32 = 3.0;
 
 /// Exposure of a masked pixel above which it is masked for clipping.
 const CLIPPED: f32 = 0.5;
@@ -266,6 +269,61 @@ pub fn drawn(
     Plane { data: latent.data.iter().zip(&step).map(|(e, s)| e * (spread * s).clamp(-1.0, 1.0).exp()).collect(), ..latent.clone() }
 }
 
+/// What pixels that a latent luminance has not seen say about the blurs.
+pub struct CrossValidation {
+    /// Of each frame.
+    pub unseen: Vec<Unseen>,
+    /// P = E ∘ (the inverse of the normal equations) E ∘ Σ KᵀW r, the sum over the unseen pixels: the adjoint state, on the latent grid.
+    pub sensitivity: Plane,
+    /// Weighted mean of the squared residuals of the unseen pixels.
+    pub misfit: f64,
+}
+
+/// What the pixels `unseen` say about the blurs, `latent` being solved from the others that `held` leaves (`unseen` are held as well): how their residuals change
+/// with each K, and with the luminance that follows from it (implicit differentiation of the solve; the weights of the smoothness are held).
+pub fn cross_validated(
+    frames: &[Frame],
+    operators: &[Operator],
+    latent: &Plane,
+    (held, unseen): (&[bool], &[bool]),
+    effort: &Effort,
+) -> CrossValidation {
+    let data = Data::new(frames, operators, held, latent.size(), effort);
+    let system = data.system(&logarithm(latent));
+    // Linear where a residual is far beyond what is expected: a few pixels that nothing explains would decide.
+    let weights: Vec<Vec<f32>> = (0..frames.len())
+        .map(|k| {
+            let (f, residual) = (&frames[k], &system.residuals[k]);
+            let weight = |p: usize| {
+                let w = f.mask.data[p].powi(2) / (f.variance.data[p] + data.models[k].data[p]);
+                w * (OUTLYING / (residual[p].abs() * w.sqrt()).max(OUTLYING))
+            };
+            (0..unseen.len()).map(|p| if unseen[p] && data.insides[k][p] { weight(p) } else { 0.0 }).collect()
+        })
+        .collect();
+    let times = |a: &[f32], b: &[f32]| -> Vec<f32> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
+    let mut right = vec![0.0f32; latent.data.len()];
+    let (mut sum, mut count) = (0.0, 0.0);
+    for ((operator, residual), weight) in operators.iter().zip(&system.residuals).zip(&weights) {
+        let pull = times(residual, weight);
+        sum += dot(residual, &pull);
+        count += weight.iter().filter(|w| **w > 0.0).count() as f64;
+        right.iter_mut().zip(&operator.adjoint(&pull)).for_each(|(a, b)| *a += b);
+    }
+    let step = system.step(times(&right, &system.e), effort.inner);
+    let sensitivity = Plane { data: times(&step, &system.e), ..latent.clone() };
+    let (width, height) = frames[0].blurred.size();
+    let plane = |data| Plane { width, height, data };
+    let unseen = (0..frames.len()).zip(weights).map(|(k, weight)| {
+        let residual = &system.residuals[k];
+        let through = times(residual, &system.weights[k]);
+        let known = times(&operators[k].forward(&sensitivity.data), &system.weights[k]);
+        let direct = times(residual, &weight).iter().zip(&known).map(|(a, b)| a - b).collect();
+        Unseen { direct: plane(direct), through: plane(through), weight: plane(weight) }
+    });
+    CrossValidation { unseen: unseen.collect(), misfit: if count > 0.0 { sum / count } else { f64::NAN }, sensitivity }
+}
+
 fn logarithm(latent: &Plane) -> Vec<f32> {
     latent.data.iter().map(|v| v.max(f32::MIN_POSITIVE).ln()).collect()
 }
@@ -387,5 +445,52 @@ mod tests {
         }
         let off = (&found - &expected).norm() / expected.norm();
         assert!(off < 0.1, "the covariance is off by {off}");
+    }
+
+    /// Against differences of the residuals of scenes solved anew, the blur a little to each side. The scene is soft, so that the smoothness weighs its gradients as it
+    /// weighs none, and the frame all but free of noise, so that the normal equations are the Hessian.
+    #[test]
+    fn unseen_residuals_change_with_the_blur_as_the_adjoint_state_says() {
+        let (size, pad) = ((18, 13), 3);
+        let (w, h) = (size.0 + 2 * pad, size.1 + 2 * pad);
+        let at = |t: f64| {
+            let poses = vec![Pose::planar(-1.4 - 0.3 * t, 0.3, 1.0, 0.5 - 0.2 * t), Pose::planar(1.2, -0.4 + 0.5 * t, -1.0, 0.5 + 0.2 * t)];
+            operators(&[Tsf::new(20.0, poses).unwrap()], size, pad)
+        };
+        let truth = Plane::from_fn(w, h, |x, y| (0.002 * ((0.5 * x as f32).sin() + (0.4 * y as f32 + 0.2 * x as f32).cos())).exp());
+        // Under another blur than those around which the residuals are looked at.
+        let blurred = Plane { width: size.0, height: size.1, data: at(0.8)[0].forward(&truth.data) };
+        let of = |v: f32| blurred.map(|_| v);
+        let frame = Frame { variance: of(1e-6), mask: of(1.0), clipped: vec![false; blurred.data.len()], blurred: blurred.clone() };
+        let frames = [frame];
+        let fold: Vec<bool> = (0..size.0 * size.1).map(|p| (p % size.0 * 2 + p / size.0) % 5 == 2).collect();
+        let effort = Effort { lambda: 3.0, outer: 12, inner: 300, model_error: 0.0 };
+        let found = |t: f64| {
+            let operators = at(t);
+            let latent = solve(&frames, &operators, &truth, &fold, &effort);
+            let validated = cross_validated(&frames, &operators, &latent, (&fold, &fold), &effort);
+            (latent, validated)
+        };
+        let unseen = |v: &CrossValidation| v.unseen[0].weight.data.iter().filter(|w| **w > 0.0).count() as f64;
+        let loss = |t: f64| {
+            let v = found(t).1;
+            0.5 * v.misfit * unseen(&v)
+        };
+        let (latent, validated) = found(0.0);
+        let step = 0.02;
+        let measured = (loss(step) - loss(-step)) / (2.0 * step);
+        let moved = |plane: &Plane| -> Vec<f32> {
+            let (ahead, behind) = (at(step)[0].forward(&plane.data), at(-step)[0].forward(&plane.data));
+            ahead.iter().zip(&behind).map(|(a, b)| (a - b) / (2.0 * step as f32)).collect()
+        };
+        let (direct, through) = (&validated.unseen[0].direct.data, &validated.unseen[0].through.data);
+        let said = -dot(&moved(&latent), direct) - dot(&moved(&validated.sensitivity), through);
+        let predicted = at(0.0)[0].forward(&latent.data);
+        let residual = frames[0].blurred.data.iter().zip(&predicted).map(|(b, p)| b - p);
+        let pull: Vec<f32> = residual.zip(&validated.unseen[0].weight.data).map(|(r, w)| r * w).collect();
+        let held = -dot(&moved(&latent), &pull);
+        println!("{said:.3} for {measured:.3}, the scene held {held:.3}");
+        assert!((said - measured).abs() < 0.08 * measured.abs(), "{said} for {measured}");
+        assert!((held - measured).abs() > 0.3 * measured.abs(), "what the scene does counts: {held} for {measured}");
     }
 }

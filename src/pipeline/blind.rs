@@ -685,6 +685,36 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
+    /// `tsfs`, those of the frames `used` but for `still` such that pixels of them that the scene has not seen are explained better, from the scene `latent`.
+    /// Frames that the joint estimate would shrink keep theirs: the steps are many, and each is as dear as the frame is large.
+    pub(super) fn cross_validated(
+        &mut self,
+        used: &[usize],
+        still: &[usize],
+        tsfs: &[Option<Tsf>],
+        latent: &Rgb,
+        reference: usize,
+        (from, to): (f32, f32),
+    ) -> Result<Vec<Option<Tsf>>> {
+        let mut tsfs = tsfs.to_vec();
+        if !blind::fits(latent.size()) {
+            return Ok(tsfs);
+        }
+        let channels = self.most_telling(used, used);
+        let frames = self.luminance_frames(used, channels);
+        let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
+        let centre = used.iter().position(|&i| i == reference).unwrap_or(0);
+        let events = &mut self.events;
+        let found = blind::cross_validated(&frames, &latent.mean_of(channels), &known, &places(still, used), centre, &mut |s| {
+            events(Event::Progress { stage: "refining the blurs by pixels held out".into(), fraction: from + (to - from) * s.fraction })
+        })
+        .ok_or(Error::Cancelled)?;
+        for (&i, tsf) in used.iter().zip(found) {
+            tsfs[i] = Some(tsf);
+        }
+        Ok(tsfs)
+    }
+
     /// Whether some of the frames `still` among those `used`, which were taken for sharp in doubt, moved by a pixel or two: if that explains all frames
     /// better than the TSFs `tsfs` found while they stood, by more than a harder scene behind a softer lens, which blurs them alike.
     pub(super) fn set_free(

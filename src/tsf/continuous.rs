@@ -68,6 +68,13 @@ impl<'a> Evidence<'a> {
         }
     }
 
+    /// All pixels of a frame of `size`, and no differences.
+    pub fn of_pixels(latent: &'a Plane, pad: usize, base: DMat3, size: (usize, usize)) -> Self {
+        let centre = DVec2::new((size.0 as f64 - 1.0) / 2.0, (size.1 as f64 - 1.0) / 2.0);
+        let pixels = (0..size.0 * size.1).map(|p| DVec2::new((p % size.0) as f64, (p / size.0) as f64) - centre).collect();
+        Self { latent, back: base.inverse(), origin: centre + DVec2::splat(pad as f64), pixels, rows: Vec::new(), targets: Vec::new() }
+    }
+
     /// Weighted differences that `pose` makes of the latent irradiance: its column of A.
     fn column(&self, pose: &Pose, focal: f64) -> Vec<f32> {
         let turn = Projection::new(self.back * pose.rotation(focal).inverse());
@@ -243,7 +250,7 @@ impl<'a> Evidence<'a> {
     }
 
     /// Latent irradiance under every pixel as the pose sees it, and its derivatives by the chart's coordinates.
-    fn look(&self, chart: &Chart, pose: &Pose) -> (Vec<f32>, Vec<[f32; 5]>) {
+    pub fn look(&self, chart: &Chart, pose: &Pose) -> (Vec<f32>, Vec<[f32; 5]>) {
         let inverse = pose.rotation(chart.focal).inverse();
         let (turn, inverse) = (Projection::new(self.back * inverse), Projection::new(inverse));
         let base = linear_part(&self.back);
@@ -275,7 +282,7 @@ fn linear_part(h: &DMat3) -> [DVec2; 2] {
 }
 
 /// `aᵀ a` and `aᵀ b`, in parallel over blocks of rows.
-fn normal(a: &DMatrix<f32>, b: &[f32]) -> (DMatrix<f64>, DVector<f64>) {
+pub(super) fn normal(a: &DMatrix<f32>, b: &[f32]) -> (DMatrix<f64>, DVector<f64>) {
     let n = a.ncols();
     let starts: Vec<usize> = (0..a.nrows()).step_by(2048).collect();
     let part = |s: usize| {

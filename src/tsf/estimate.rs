@@ -246,7 +246,7 @@ fn around(tsf: &Tsf, chart: &Chart, step: f64) -> Vec<Pose> {
 }
 
 /// Continuous poses for the lattice poses of `tsf`: as close together as their number allows.
-fn gathered(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
+pub(super) fn gathered(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
     let mut particles = Vec::new();
     for radius in GATHER {
         particles = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
@@ -525,7 +525,7 @@ pub fn filled(tsf: &Tsf, factor: f64) -> Tsf {
 }
 
 /// The narrowest model that holds all poses of `tsf`.
-fn model_of(tsf: &Tsf) -> Model {
+pub(super) fn model_of(tsf: &Tsf) -> Model {
     let any = |f: fn(&Pose) -> f64| tsf.poses.iter().any(|p| f(p).abs() > 1e-9);
     match (any(|p| p.theta_x_deg) || any(|p| p.theta_y_deg), any(|p| p.t_x) || any(|p| p.t_y)) {
         (true, true) => Model::Full,

@@ -8,6 +8,7 @@ mod estimate;
 mod from_psfs;
 mod model;
 mod taps;
+mod unseen;
 mod whole_frame;
 
 pub use align_across::{align_across, blurred};
@@ -17,6 +18,7 @@ pub use estimate::{Estimate, Search, Trial, extent, path_at, stroke};
 pub use from_psfs::from_psfs;
 pub use model::Model;
 pub use taps::{INDISTINGUISHABLE, Interpolation, Tap, TapSet, WARP_COST};
+pub use unseen::{Latent, Stride, Unseen, divided};
 pub use whole_frame::WholeFrame;
 
 use crate::error::{Error, Result};
@@ -38,6 +40,24 @@ pub struct Tsf {
 }
 
 impl Tsf {
+    /// Moves each pose `part` of the way to that of `other`, which has as many.
+    ///
+    /// # Panics
+    /// Where it has not.
+    pub fn move_towards(&mut self, other: &Self, part: f64) {
+        assert_eq!(self.poses.len(), other.poses.len(), "pose by pose");
+        let to = |a: &mut f64, b: f64| *a += part * (b - *a);
+        for (p, q) in self.poses.iter_mut().zip(&other.poses) {
+            to(&mut p.t_x, q.t_x);
+            to(&mut p.t_y, q.t_y);
+            to(&mut p.theta_x_deg, q.theta_x_deg);
+            to(&mut p.theta_y_deg, q.theta_y_deg);
+            to(&mut p.theta_z_deg, q.theta_z_deg);
+            to(&mut p.weight, q.weight);
+        }
+        self.base = other.base;
+    }
+
     /// Checks and normalises: poses of zero weight are dropped, the others' weights scaled to sum 1.
     ///
     /// # Errors
