@@ -748,6 +748,7 @@ impl Run<'_> {
         let mut solution = None;
         let estimated = if reduced { shaken.clone() } else { estimated };
         let mut looked_at_twice: Vec<usize> = Vec::new();
+        let (mut validating, mut fitted) = (true, Vec::new());
         let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
         let mut round = 0;
         while round < rounds && !shaken.is_empty() {
@@ -755,16 +756,19 @@ impl Run<'_> {
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
-                    let now = format!("{i} {round} {shaken:?} {looked_at_twice:?}");
+                    let now = format!("{i} {round} {shaken:?} {looked_at_twice:?} {validating}");
                     tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, &latent, tsfs[i].as_ref())))?;
                 }
-                let now = format!("{round} {shaken:?} {looked_at_twice:?}");
-                tsfs = self.remembered(
-                    "cross-validation",
-                    &now,
-                    |_| 0,
-                    |run| run.cross_validated(&all, &still, &tsfs, &latent, reference, (at(0.05), at(0.2))),
-                )?;
+                fitted.clone_from(&tsfs);
+                if validating {
+                    let now = format!("{round} {shaken:?} {looked_at_twice:?}");
+                    tsfs = self.remembered(
+                        "cross-validation",
+                        &now,
+                        |_| 0,
+                        |run| run.cross_validated(&all, &still, &tsfs, &latent, reference, (at(0.05), at(0.2))),
+                    )?;
+                }
             }
             if round + 1 == rounds {
                 self.find_aliasing(&still, &shaken, &latent, at(0.2), at(0.3))?;
@@ -776,7 +780,7 @@ impl Run<'_> {
             };
             // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
             let settings = if round + 1 < rounds { for_first_round(&self.settings.deblur) } else { self.settings.deblur.clone() };
-            let now = format!("{round} {shaken:?} {looked_at_twice:?}");
+            let now = format!("{round} {shaken:?} {looked_at_twice:?} {validating}");
             let solved =
                 self.solved("irradiance", &now, &settings, |run| run.solve(&all, &tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
             let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
@@ -794,6 +798,12 @@ impl Run<'_> {
                 continue;
             }
             solution = None;
+            // Beside what clips everywhere no pixel is held out: what is wrong there is not seen before the frames are solved for.
+            if round > 0 && validating {
+                validating = false;
+                tsfs.clone_from(&fitted);
+                continue;
+            }
             let ids: Vec<usize> = hopeless.iter().map(|h| h.0).filter(|i| !looked_at_twice.contains(i) && !details[*i].is_null()).collect();
             looked_at_twice.extend(&ids);
             if self.look_for_slight(&ids, &start, &mut tsfs, &mut details, at(1.0))? {

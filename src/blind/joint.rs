@@ -112,8 +112,10 @@ const ROUNDS: (usize, usize, usize) = (12, 5, 2);
 /// Parts of the pixels that are held out in turn where TSFs are cross-validated.
 const FOLDS: usize = 5;
 /// Steps of that at the level where all blurs are found, at finer ones, and beside sharp frames; iterations of the solves of each.
-const STEPS: (usize, usize, usize) = (30, 10, 20);
+const STEPS: (usize, usize, usize) = (30, 10, 15);
 const SOLVED: usize = 15;
+/// Growth of the residuals of a frame beside sharp ones from which the steps are not believed.
+const WORSE: f64 = 1.1;
 /// Part of the mean over the last steps that an older one keeps: each sees a part of the pixels alone.
 const OLDER: f64 = 0.8;
 /// Growth of the residuals of a part from which the last step was too long: since it was last held out, and the first time, over the least of the others.
@@ -782,8 +784,10 @@ pub fn cross_validated(
         done += 1;
         progress(Stage { scale: 1, fraction: done as f32 / STEPS.2 as f32 })
     })?;
-    let residual = |state: &State| geometric_mean(&level.judge(state));
-    Some(if residual(&found) < residual(&state) { found.tsfs } else { tsfs.to_vec() })
+    let (before, after) = (level.judge(&state), level.judge(&found));
+    // No frame at another's expense.
+    let worse = before.iter().zip(&after).any(|(before, after)| *after > WORSE * before);
+    Some(if !worse && geometric_mean(&after) < geometric_mean(&before) { found.tsfs } else { tsfs.to_vec() })
 }
 
 /// See [`Freed::unlike`], of blurs with the covariances `spreads`.
