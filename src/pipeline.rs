@@ -762,11 +762,13 @@ impl Run<'_> {
                 fitted.clone_from(&tsfs);
                 if validating {
                     let now = format!("{round} {shaken:?} {looked_at_twice:?}");
+                    // Those that were given are what they are.
+                    let held: Vec<usize> = all.iter().copied().filter(|i| !estimated.contains(i)).collect();
                     tsfs = self.remembered(
                         "cross-validation",
                         &now,
                         |_| 0,
-                        |run| run.cross_validated(&all, &still, &tsfs, &latent, reference, (at(0.05), at(0.2))),
+                        |run| run.cross_validated(&all, &held, &tsfs, &latent, reference, (at(0.05), at(0.2))),
                     )?;
                 }
             }

@@ -2,7 +2,8 @@
 //!
 //! Coarse to fine over the whole bracket, on luminance: with the TSFs held, the latent luminance that explains all frames
 //! (a solver on the CPU); with the luminance held, each frame's TSF from the whole frame ([`crate::tsf::WholeFrame`]). It starts from the least
-//! blurred frame, the smoothness is strong at first and falls.
+//! blurred frame, the smoothness is strong at first and falls. At the end the TSFs are cross-validated: pixels held out in turn have to be explained by
+//! the luminance that the others give.
 //!
 //! Any common warp of all TSFs can be made good by the opposite warp of the scene. It is fixed so that the mean pose of the reference
 //! frame is the identity.

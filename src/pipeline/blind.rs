@@ -685,12 +685,12 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// `tsfs`, those of the frames `used` but for `still` such that pixels of them that the scene has not seen are explained better, from the scene `latent`.
+    /// `tsfs`, those of the frames `used` but for `held` such that pixels of them that the scene has not seen are explained better, from the scene `latent`.
     /// Frames that the joint estimate would shrink keep theirs: the steps are many, and each is as dear as the frame is large.
     pub(super) fn cross_validated(
         &mut self,
         used: &[usize],
-        still: &[usize],
+        held: &[usize],
         tsfs: &[Option<Tsf>],
         latent: &Rgb,
         reference: usize,
@@ -705,7 +705,7 @@ impl Run<'_> {
         let known: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
         let centre = used.iter().position(|&i| i == reference).unwrap_or(0);
         let events = &mut self.events;
-        let found = blind::cross_validated(&frames, &latent.mean_of(channels), &known, &places(still, used), centre, &mut |s| {
+        let found = blind::cross_validated(&frames, &latent.mean_of(channels), &known, &places(held, used), centre, &mut |s| {
             events(Event::Progress { stage: "refining the blurs by pixels held out".into(), fraction: from + (to - from) * s.fraction })
         })
         .ok_or(Error::Cancelled)?;

@@ -77,7 +77,7 @@ pub struct Stride {
     /// The last step: coordinates and weight of each pose; empty at first.
     velocity: Vec<f64>,
     /// Part of a full step, 0..=1.
-    pub rate: f64,
+    rate: f64,
 }
 
 impl Stride {
