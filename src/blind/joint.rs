@@ -111,8 +111,8 @@ const COARSEST: usize = 250;
 const ROUNDS: (usize, usize, usize) = (12, 5, 2);
 /// Parts of the pixels that are held out in turn where TSFs are cross-validated.
 const FOLDS: usize = 5;
-/// Steps of that at the level where all blurs are found, at finer ones, and beside sharp frames; iterations of the solves of each.
-const STEPS: (usize, usize, usize) = (30, 10, 15);
+/// Steps of that at the second level, and beside sharp frames; iterations of the solves of each.
+const STEPS: (usize, usize) = (30, 15);
 const SOLVED: usize = 15;
 /// Growth of the residuals of a frame beside sharp ones from which the steps are not believed.
 const WORSE: f64 = 1.1;
@@ -690,10 +690,11 @@ pub fn estimate(
     let in_doubt = !doubted.frames.is_empty();
     let search = cost(first, ROUNDS.0 * starts.len());
     let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + cost(s, 3 * ROUNDS.1 + STEPS.0));
+    let ends = if in_doubt { 3.0 } else { 1.0 };
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += if in_doubt { 2.0 * cost(s, ROUNDS.2) } else { 0.0 } + cost(s, STEPS.1);
+        total += ends * cost(s, ROUNDS.2);
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -716,7 +717,7 @@ pub fn estimate(
             let growth = if in_doubt { look.level.growth(&look.state, doubted.frames) } else { 1.0 };
             break 'found (look.level, look.state, Vec::new(), growth);
         };
-        let mut level = Level::new(frames, scale, true);
+        let level = Level::new(frames, scale, true);
         let mut plain = None;
         if in_doubt {
             let state = without_draws(&level, &look, &mut advance)?;
@@ -735,22 +736,13 @@ pub fn estimate(
             }
             if_still = growth;
         }
-        let mut validated = level.validated(&state, &[], STEPS.0, &mut || advance(scale))?;
+        let validated = level.validated(&state, &[], STEPS.0, &mut || advance(scale))?;
         let held_out = geometric_mean(&level.judge(&validated));
+        let (_, (state, draws)) = better(Some((ways[0].held_out, (state, draws))), (held_out, (validated, Some(Random::new(SEED, 3)))));
         ways.push(Way { draws: Draws::Validated, held_out });
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
-        if ways[0].draws != Draws::Validated {
-            let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
-            break 'found (level, state, ways, if_still);
-        }
-        while level.scale > last {
-            let finer = Level::new(frames, level.scale / 2, true);
-            let mut state = finer.refine(validated, &level);
-            finer.solve(&mut state, SMOOTHNESS.1, MODEL_ERROR.1, 3);
-            validated = finer.validated(&state, &[], STEPS.1, &mut || advance(finer.scale))?;
-            level = finer;
-        }
-        (level, validated, ways, if_still)
+        let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
+        (level, state, ways, if_still)
     };
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
@@ -780,9 +772,9 @@ pub fn cross_validated(
     let mut state = level.placed(latent, tsfs, reference);
     level.settle(&mut state);
     let mut done = 0;
-    let found = level.validated(&state, still, STEPS.2, &mut || {
+    let found = level.validated(&state, still, STEPS.1, &mut || {
         done += 1;
-        progress(Stage { scale: 1, fraction: done as f32 / STEPS.2 as f32 })
+        progress(Stage { scale: 1, fraction: done as f32 / STEPS.1 as f32 })
     })?;
     let (before, after) = (level.judge(&state), level.judge(&found));
     // No frame at another's expense.
