@@ -95,6 +95,11 @@ impl<'a> Data<'a> {
         }
     }
 
+    /// The weight of pixel `p` of frame `k` where it counts `m`, 0..=1: its inverse variance, that of the operator's error included.
+    fn weight(&self, k: usize, p: usize, m: f32) -> f32 {
+        m * m / (self.frames[k].variance.data[p] + self.models[k].data[p])
+    }
+
     /// The weights of frame `k` where its residual is `residual`.
     fn weights(&self, k: usize, residual: &[f32]) -> Vec<f32> {
         let (frame, inside) = (&self.frames[k], &self.insides[k]);
@@ -103,7 +108,7 @@ impl<'a> Data<'a> {
         let bounded = |p: usize| frame.clipped[p] && inside[p] && residual[p] > 0.0;
         let weight = |p: usize| {
             let m = if bounded(p) { 1.0 } else { usable(p) };
-            if m == 0.0 { 0.0 } else { m * m / (frame.variance.data[p] + self.models[k].data[p]) }
+            if m == 0.0 { 0.0 } else { self.weight(k, p, m) }
         };
         (0..residual.len()).map(weight).collect()
     }
@@ -295,7 +300,7 @@ pub fn cross_validated(
         .map(|k| {
             let (f, residual) = (&frames[k], &system.residuals[k]);
             let weight = |p: usize| {
-                let w = f.mask.data[p].powi(2) / (f.variance.data[p] + data.models[k].data[p]);
+                let w = data.weight(k, p, f.mask.data[p]);
                 w * (OUTLYING / (residual[p].abs() * w.sqrt()).max(OUTLYING))
             };
             (0..unseen.len()).map(|p| if unseen[p] && data.insides[k][p] { weight(p) } else { 0.0 }).collect()

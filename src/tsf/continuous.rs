@@ -29,7 +29,7 @@ pub(super) struct Evidence<'a> {
 
 /// √weight of the row that says that weights sum to 1, as a part of the root mean square of the columns: exposures are known to a per cent or
 /// better, and an operator that is off by a per cent in brightness is off everywhere.
-const SUM: f64 = 30.0;
+pub(super) const SUM: f64 = 30.0;
 /// Standard deviation, in pixels at the frame's sides, that the perspective of pitch and yaw is expected to have where the frame does
 /// not say.
 const PERSPECTIVE: f64 = 2.0;

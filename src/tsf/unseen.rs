@@ -6,10 +6,11 @@
 //! [`crate::blind`]'s luminance).
 
 use super::Tsf;
-use super::continuous::{Evidence, normal};
+use super::continuous::{Evidence, SUM, normal};
 use super::estimate::{gathered, model_of};
 use super::model::{Chart, Coordinates};
 use crate::image::Plane;
+use crate::pose::Pose;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
@@ -47,8 +48,6 @@ const SHORTER: f64 = 0.7;
 const SHORTENED: f64 = 0.3;
 /// Damping as a part of the Hessian's diagonal.
 const DAMPING: f64 = 0.1;
-/// Weight of the sum of weights, which is 1, as a part of the mean curvature by a weight.
-const SUM: f64 = 30.0;
 /// Farthest that a pose goes in one step, in pixels.
 const STEP: f64 = 0.3;
 
@@ -147,7 +146,7 @@ impl Unseen {
         let sensitivity = Evidence::of_pixels(latent.sensitivity, latent.pad, tsf.base, (w, h));
         let unseen: Vec<(usize, f32)> =
             (0..w * h).filter(|&p| self.weight.data[p] > 0.0).map(|p| (p, self.weight.data[p].sqrt())).collect();
-        let of = |pose: &crate::pose::Pose| {
+        let of = |pose: &Pose| {
             let ((e, along), (s, through)) = (scene.look(chart, pose), sensitivity.look(chart, pose));
             let pulls = self.direct.data.iter().zip(&self.through.data);
             let mut descent = vec![0.0f64; free + 1];
@@ -174,7 +173,6 @@ impl Unseen {
 mod tests {
     use super::*;
     use crate::blind::Operator;
-    use crate::pose::Pose;
 
     /// Against what operators of the poses, a little to each side, make of scene and sensitivity.
     #[test]
