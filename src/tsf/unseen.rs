@@ -172,16 +172,17 @@ impl Unseen {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::blind::Operator;
+    use glam::DVec2;
 
-    /// Against what operators of the poses, a little to each side, make of scene and sensitivity.
+    /// Against what the poses, a little to each side, make of scene and sensitivity where these are known between pixels too.
     #[test]
     fn slopes_are_those_of_the_blurred_scene() {
         let (size, pad) = ((40, 31), 8);
         let (w, h) = (size.0 + 2 * pad, size.1 + 2 * pad);
-        let wave = |x: usize, y: usize, a: f32, b: f32| 1.0 + 0.5 * (a * x as f32).sin() * (b * y as f32 + 0.1 * x as f32).cos();
-        let scene = Plane::from_fn(w, h, |x, y| wave(x, y, 0.5, 0.4));
-        let sensitivity = Plane::from_fn(w, h, |x, y| wave(x, y, 0.3, 0.6) - 1.0);
+        let wave = |x: f64, y: f64, a: f64, b: f64| 1.0 + 0.5 * (a * x).sin() * (b * y + 0.1 * x).cos();
+        let scene = |x: f64, y: f64| wave(x, y, 0.5, 0.4);
+        let sensitivity = |x: f64, y: f64| wave(x, y, 0.3, 0.6) - 1.0;
+        let sampled = |of: &dyn Fn(f64, f64) -> f64| Plane::from_fn(w, h, |x, y| of(x as f64, y as f64) as f32);
         let inner = |x: usize, y: usize| x >= 6 && y >= 6 && x + 6 < size.0 && y + 6 < size.1;
         let plane = |f: &dyn Fn(usize, usize) -> f32| Plane::from_fn(size.0, size.1, |x, y| if inner(x, y) { f(x, y) } else { 0.0 });
         let unseen = Unseen {
@@ -191,12 +192,12 @@ mod tests {
         };
         let tsf = Tsf::new(60.0, vec![Pose::planar(-1.3, 0.4, 0.8, 0.4), Pose::planar(0.7, -0.6, -0.5, 0.6)]).unwrap();
         let chart = Chart::new(model_of(&tsf), tsf.focal_px, size.0, size.1);
-        let latent = Latent { irradiance: &scene, sensitivity: &sensitivity, pad };
+        let latent = Latent { irradiance: &sampled(&scene), sensitivity: &sampled(&sensitivity), pad };
         let (descent, hessian) = unseen.slopes(&latent, &tsf, &chart);
         let places: Vec<(Coordinates, f64)> = tsf.poses.iter().map(|p| (chart.coordinates(p), p.weight)).collect();
         let step = 0.05;
         // The pose `i`, its number `k` moved by `by`; a weight alone, whatever the sum.
-        let blurred = |i: usize, k: usize, by: f64, plane: &Plane| -> Vec<f64> {
+        let blurred = |i: usize, k: usize, by: f64, of: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
             let mut sum = vec![0.0; size.0 * size.1];
             for (j, (mut c, mut weight)) in places.iter().copied().enumerate() {
                 if i == j && k < 3 {
@@ -204,14 +205,19 @@ mod tests {
                 } else if i == j {
                     weight += by;
                 }
-                let alone = Tsf::new(tsf.focal_px, vec![chart.pose(&c, 1.0)]).unwrap();
-                let one = Operator::new(&alone, size.0, size.1, pad).forward(&plane.data);
-                sum.iter_mut().zip(&one).for_each(|(s, v)| *s += weight * f64::from(*v));
+                let pose = chart.pose(&c, 1.0);
+                let (sin, cos) = pose.theta_z_deg.to_radians().sin_cos();
+                let centre = DVec2::new((size.0 as f64 - 1.0) / 2.0, (size.1 as f64 - 1.0) / 2.0);
+                for (n, s) in sum.iter_mut().enumerate() {
+                    let q = DVec2::new((n % size.0) as f64, (n / size.0) as f64) - centre - DVec2::new(pose.t_x, pose.t_y);
+                    let p = DVec2::new(cos * q.x + sin * q.y, cos * q.y - sin * q.x) + centre + DVec2::splat(pad as f64);
+                    *s += weight * of(p.x, p.y);
+                }
             }
             sum
         };
-        let slope = |i: usize, k: usize, plane: &Plane| -> Vec<f64> {
-            let (ahead, behind) = (blurred(i, k, step, plane), blurred(i, k, -step, plane));
+        let slope = |i: usize, k: usize, of: &dyn Fn(f64, f64) -> f64| -> Vec<f64> {
+            let (ahead, behind) = (blurred(i, k, step, of), blurred(i, k, -step, of));
             ahead.iter().zip(&behind).map(|(a, b)| (a - b) / (2.0 * step)).collect()
         };
         let dot = |a: &[f64], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * f64::from(*b)).sum::<f64>();
