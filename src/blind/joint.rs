@@ -39,29 +39,28 @@ pub struct Joint {
     pub held_out_merge: Vec<f64>,
     /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
     pub if_still: f64,
-    /// The ways that were tried after the first level, the one that was gone on with first; none where there is one level.
+    /// What TSFs were fitted to at the second level, the best first, with which the estimate went on; none where there is one level, and where frames in
+    /// doubt stood still.
     pub ways: Vec<Way>,
 }
 
-/// Levels at which TSFs are fitted to drawn scenes instead of the best one.
+/// What TSFs are fitted to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Draws {
-    /// At none.
-    None,
-    /// At all but the first.
-    Finer,
-    /// At all.
-    All,
-    /// As the best of these, and on by cross-validation.
-    Validated,
+pub enum FittedTo {
+    /// The best scene under the TSFs so far.
+    Best,
+    /// A scene drawn around it.
+    Drawn,
+    /// Pixels that the scene was not solved from.
+    Unseen,
 }
 
-/// A way to the second level, and how it did there.
+/// A way to the TSFs of the second level, and how it did there.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Way {
-    /// Where scenes were drawn.
-    pub draws: Draws,
+    /// What they were fitted to at the end.
+    pub fitted_to: FittedTo,
     /// Geometric mean over the frames of the squared residual over noise variance on pixels that no part of the estimate has seen.
     pub held_out: f64,
 }
@@ -123,6 +122,8 @@ const ROSE: f64 = 1.1;
 const FIRST_ROSE: f64 = 1.5;
 /// Pixels above which a level is not worked on: what is found at the finest below serves the frame.
 const LARGEST: usize = 500_000;
+/// Rounds with drawn scenes at the coarsest level and at the next.
+const DRAWN_ROUNDS: (usize, usize) = (5, 5);
 /// Rounds of those at the coarsest level before smoothness falls.
 const SEARCH: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
@@ -534,15 +535,15 @@ fn better<T>(best: Option<(f64, T)>, other: (f64, T)) -> (f64, T) {
 }
 
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
-/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `draws` as in [`Level::round`].
-/// `None` when `going` returns `false`, which it is asked after each round.
-fn at_coarsest(level: &Level, starts: &[Start], mut draws: Option<&mut Random>, going: &mut dyn FnMut() -> bool) -> Option<State> {
+/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
+/// `false`, which it is asked after each round.
+fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best = None;
     for start in starts {
         let mut state = level.begin(start);
         for k in 0..ROUNDS.0 {
             let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), draws.as_deref_mut());
+            level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None);
             if !going() {
                 return None;
             }
@@ -574,7 +575,7 @@ fn at_finer(
     Some(state)
 }
 
-/// What the coarsest level tells without drawn scenes.
+/// What the coarsest level tells.
 pub struct Look {
     level: Level,
     state: State,
@@ -586,7 +587,7 @@ impl Look {
         let scale = coarsest(frames);
         let (mut done, total) = (0, ROUNDS.0 * starts.len());
         let level = Level::new(frames, scale, false);
-        let state = at_coarsest(&level, starts, None, &mut || {
+        let state = at_coarsest(&level, starts, &mut || {
             done += 1;
             progress(Stage { scale, fraction: done as f32 / total as f32 })
         })?;
@@ -606,44 +607,19 @@ impl Look {
     }
 }
 
-/// What `look` saw at the second level, `finer`, without drawn scenes. `None` as for [`at_coarsest`].
-fn without_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> bool) -> Option<State> {
-    at_finer(finer, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(finer.scale))
-}
-
-/// Whether drawn scenes help tells the second level, `finer`, not the first: without them, with them from there on, and with them at all, where
-/// the first one is done again from `starts`. The ones make blurs too short, the others, where a blur is not much longer than a pixel or the
-/// scene is not what the smoothness takes it for, too long. `plain` is what was found without, if that is known. What the best way found,
-/// with the draws that it goes on with, and all ways, the best first. `None` as for [`at_coarsest`].
-fn at_second(
-    finer: &Level,
-    look: &Look,
-    plain: Option<State>,
-    starts: &[Start],
-    advance: &mut dyn FnMut(usize) -> bool,
-) -> Option<(State, Option<Random>, Vec<Way>)> {
-    let Look { level, state } = look;
-    let mut random = Random::new(SEED, 0);
-    let drawn = at_coarsest(level, starts, Some(&mut random), &mut || advance(level.scale))?;
-    let plain = match plain {
-        Some(plain) => plain,
-        None => without_draws(finer, look, advance)?,
-    };
-    let mut second =
-        |from: &State, random: &mut Random| at_finer(finer, from.clone(), level, ROUNDS.1, Some(random), &mut || advance(finer.scale));
-    let mut from_second = Random::new(SEED, 1);
-    let finer_drawn = second(state, &mut from_second)?;
-    let all_drawn = second(&drawn, &mut random)?;
-    let mut best = None;
-    let mut ways = Vec::new();
-    let found = [(Draws::None, plain, None), (Draws::Finer, finer_drawn, Some(from_second)), (Draws::All, all_drawn, Some(random))];
-    for (draws, state, random) in found {
-        let held_out = geometric_mean(&finer.judge(&state));
-        ways.push(Way { draws, held_out });
-        best = Some(better(best, (held_out, (state, random))));
+/// What is found at the second level, `finer`, by TSFs fitted to drawn scenes: rounds of that at the coarsest level as well, after `look` at it.
+/// `None` as for [`at_coarsest`].
+fn with_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> bool) -> Option<State> {
+    let (level, mut state) = (&look.level, look.state.clone());
+    let mut random = Random::new(SEED, 1);
+    for _ in 0..DRAWN_ROUNDS.0 {
+        level.round(&mut state, 1.0, MODEL_ERROR.1, Some(&mut random));
+        if !advance(level.scale) {
+            return None;
+        }
     }
-    ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
-    best.map(|(_, (state, random))| (state, random, ways))
+    level.settle(&mut state);
+    at_finer(finer, state, level, DRAWN_ROUNDS.1, Some(&mut random), &mut || advance(finer.scale))
 }
 
 /// `state` of `level` at the level `last`, which it is or a finer one, and that level. `None` as for [`at_coarsest`].
@@ -667,9 +643,7 @@ fn at_last(
 pub struct Doubted<'a> {
     /// Positions among the frames; none where all did.
     pub frames: &'a [usize],
-    /// Growth of the residuals, if they are held, up to which they surely stood still: nothing is to be drawn then.
-    pub surely: f64,
-    /// The same up to which they stood still: nothing is to be averaged then.
+    /// Growth of the residuals, if they are held, up to which they stood still: no TSFs are to be cross-validated then.
     pub at_most: f64,
 }
 
@@ -688,13 +662,12 @@ pub fn estimate(
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     let next = (first > last).then_some(first / 2);
     let in_doubt = !doubted.frames.is_empty();
-    let search = cost(first, ROUNDS.0 * starts.len());
-    let mut total = if look.is_none() { search } else { 0.0 } + next.map_or(0.0, |s| search + cost(s, 3 * ROUNDS.1 + STEPS.0));
-    let ends = if in_doubt { 3.0 } else { 1.0 };
+    let search = if look.is_none() { cost(first, ROUNDS.0 * starts.len()) } else { 0.0 };
+    let mut total = search + next.map_or(0.0, |s| cost(first, DRAWN_ROUNDS.0) + cost(s, ROUNDS.1 + DRAWN_ROUNDS.1 + STEPS.0));
     let mut s = next.unwrap_or(last);
     while s > last {
         s /= 2;
-        total += ends * cost(s, ROUNDS.2);
+        total += if in_doubt { 2.0 } else { 1.0 } * cost(s, ROUNDS.2);
     }
     let mut done = 0.0;
     let mut advance = |scale: usize| {
@@ -706,43 +679,38 @@ pub fn estimate(
         Some(look) => look,
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
-    // What `state` of the level `finer` comes to at the last one, and by how much its residuals grow if the frames in doubt are held there.
-    let asked = |finer: &Level, state: &State, draws: Option<&Random>, advance: &mut dyn FnMut(usize) -> bool| {
-        let (level, end) = at_last(frames, finer.clone(), state.clone(), last, draws.cloned(), advance)?;
-        let growth = level.growth(&end, doubted.frames);
-        Some((level, end, growth))
-    };
     let (level, state, ways, if_still) = 'found: {
         let Some(scale) = next else {
             let growth = if in_doubt { look.level.growth(&look.state, doubted.frames) } else { 1.0 };
             break 'found (look.level, look.state, Vec::new(), growth);
         };
         let level = Level::new(frames, scale, true);
-        let mut plain = None;
+        let best = at_finer(&level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))?;
+        let mut growth = 1.0;
         if in_doubt {
-            let state = without_draws(&level, &look, &mut advance)?;
-            let (level, end, growth) = asked(&level, &state, None, &mut advance)?;
-            if growth < doubted.surely {
+            // Asked of these, since the TSFs of frames that are held still follow by fits to the best scene, too.
+            let (level, end) = at_last(frames, level.clone(), best.clone(), last, None, &mut advance)?;
+            growth = level.growth(&end, doubted.frames);
+            if growth < doubted.at_most {
                 break 'found (level, end, Vec::new(), growth);
             }
-            plain = Some(state);
         }
-        let (state, draws, mut ways) = at_second(&level, &look, plain, starts, &mut advance)?;
-        let mut if_still = 1.0;
-        if in_doubt {
-            let (level, end, growth) = asked(&level, &state, draws.as_ref(), &mut advance)?;
-            if growth < doubted.at_most {
-                break 'found (level, end, ways, growth);
-            }
-            if_still = growth;
-        }
-        let validated = level.validated(&state, &[], STEPS.0, &mut || advance(scale))?;
-        let held_out = geometric_mean(&level.judge(&validated));
-        let (_, (state, draws)) = better(Some((ways[0].held_out, (state, draws))), (held_out, (validated, Some(Random::new(SEED, 3)))));
-        ways.push(Way { draws: Draws::Validated, held_out });
+        // Which way is the better one tells this level, not the first. Fitted to the best scene, which is blurred, TSFs are too short; to drawn ones, where a
+        // blur is not much longer than a pixel of the first level or the scene is not what the smoothness takes it for, too long.
+        let drawn = with_draws(&level, &look, &mut advance)?;
+        let mut ways = Vec::new();
+        let mut judged = |fitted_to: FittedTo, state: &State| {
+            let held_out = geometric_mean(&level.judge(state));
+            ways.push(Way { fitted_to, held_out });
+            held_out
+        };
+        let best = (judged(FittedTo::Best, &best), (best, None));
+        let fitted = better(Some(best), (judged(FittedTo::Drawn, &drawn), (drawn, Some(Random::new(SEED, 2)))));
+        let unseen = level.validated(&fitted.1.0, &[], STEPS.0, &mut || advance(scale))?;
+        let (_, (state, draws)) = better(Some(fitted), (judged(FittedTo::Unseen, &unseen), (unseen, Some(Random::new(SEED, 3)))));
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
         let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
-        (level, state, ways, if_still)
+        (level, state, ways, growth)
     };
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.

@@ -196,8 +196,6 @@ struct StoodStill {
 /// Sharp frames in place and displaced measure up to 1.3 alone and 1.5 together, frames blurred by 4 px and more from 1.5 and 2.9 on, and 1.25 where
 /// what the others did contains the one's motion.
 const STOOD_STILL: StoodStill = StoodStill { uneven: 1.2, alone: 1.5, together: 2.0 };
-/// Part of the growth beyond 1 up to which frames surely did not move, whatever way the others' blurs were found.
-const SURELY: f64 = 0.5;
 /// Evenness up to which edges are softer in one direction than across it: sharp frames without a surely steep edge measure 0.89 and more (of those
 /// with one, a bridge over water 0.84), shaken ones 0.77 to 1.0.
 const UNEVEN: f64 = 0.86;
@@ -622,7 +620,7 @@ impl Run<'_> {
         let starts = self.starts(used, channels);
         let places = places(asked, used);
         let at_most = doubt.map_or(0.0, |doubt| doubt.most_growth(asked));
-        let doubted = Doubted { frames: &places, surely: 1.0 + SURELY * (at_most - 1.0), at_most };
+        let doubted = Doubted { frames: &places, at_most };
         let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
