@@ -607,19 +607,17 @@ impl Look {
     }
 }
 
-/// What is found at the second level, `finer`, by TSFs fitted to drawn scenes: rounds of that at the coarsest level as well, after `look` at it.
-/// `None` as for [`at_coarsest`].
-fn with_draws(finer: &Level, look: &Look, advance: &mut dyn FnMut(usize) -> bool) -> Option<State> {
+/// What rounds with drawn scenes at the coarsest level make of what `look` saw there. `None` as for [`at_coarsest`].
+fn drawn_at_coarsest(look: &Look, random: &mut Random, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let (level, mut state) = (&look.level, look.state.clone());
-    let mut random = Random::new(SEED, 1);
     for _ in 0..DRAWN_ROUNDS.0 {
-        level.round(&mut state, 1.0, MODEL_ERROR.1, Some(&mut random));
-        if !advance(level.scale) {
+        level.round(&mut state, 1.0, MODEL_ERROR.1, Some(random));
+        if !going() {
             return None;
         }
     }
     level.settle(&mut state);
-    at_finer(finer, state, level, DRAWN_ROUNDS.1, Some(&mut random), &mut || advance(finer.scale))
+    Some(state)
 }
 
 /// `state` of `level` at the level `last`, which it is or a finer one, and that level. `None` as for [`at_coarsest`].
@@ -685,19 +683,29 @@ pub fn estimate(
             break 'found (look.level, look.state, Vec::new(), growth);
         };
         let level = Level::new(frames, scale, true);
-        let best = at_finer(&level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))?;
-        let mut growth = 1.0;
+        let fitted_to_best = |advance: &mut dyn FnMut(usize) -> bool| {
+            at_finer(&level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))
+        };
+        let (mut best, mut growth) = (None, 1.0);
         if in_doubt {
+            let fitted = fitted_to_best(&mut advance)?;
             // Asked of these, since the TSFs of frames that are held still follow by fits to the best scene, too.
-            let (level, end) = at_last(frames, level.clone(), best.clone(), last, None, &mut advance)?;
+            let (level, end) = at_last(frames, level.clone(), fitted.clone(), last, None, &mut advance)?;
             growth = level.growth(&end, doubted.frames);
             if growth < doubted.at_most {
                 break 'found (level, end, Vec::new(), growth);
             }
+            best = Some(fitted);
         }
         // Which way is the better one tells this level, not the first. Fitted to the best scene, which is blurred, TSFs are too short; to drawn ones, where a
         // blur is not much longer than a pixel of the first level or the scene is not what the smoothness takes it for, too long.
-        let drawn = with_draws(&level, &look, &mut advance)?;
+        let mut random = Random::new(SEED, 1);
+        let drawn = drawn_at_coarsest(&look, &mut random, &mut || advance(first))?;
+        let best = match best {
+            Some(best) => best,
+            None => fitted_to_best(&mut advance)?,
+        };
+        let drawn = at_finer(&level, drawn, &look.level, DRAWN_ROUNDS.1, Some(&mut random), &mut || advance(scale))?;
         let mut ways = Vec::new();
         let mut judged = |fitted_to: FittedTo, state: &State| {
             let held_out = geometric_mean(&level.judge(state));
@@ -705,7 +713,7 @@ pub fn estimate(
             held_out
         };
         let best = (judged(FittedTo::Best, &best), (best, None));
-        let fitted = better(Some(best), (judged(FittedTo::Drawn, &drawn), (drawn, Some(Random::new(SEED, 2)))));
+        let fitted = better(Some(best), (judged(FittedTo::Drawn, &drawn), (drawn, Some(random))));
         let unseen = level.validated(&fitted.1.0, &[], STEPS.0, &mut || advance(scale))?;
         let (_, (state, draws)) = better(Some(fitted), (judged(FittedTo::Unseen, &unseen), (unseen, Some(Random::new(SEED, 3)))));
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
