@@ -113,6 +113,8 @@ const FOLDS: usize = 5;
 /// Steps of that at the second level, and beside sharp frames; iterations of the solves of each.
 const STEPS: (usize, usize) = (30, 15);
 const SOLVED: usize = 15;
+/// Steps after which pixels that none of them sees are asked.
+const CHECKED: usize = 5;
 /// Growth of the residuals of a frame beside sharp ones from which the steps are not believed.
 const WORSE: f64 = 1.1;
 /// Part of the mean over the last steps that an older one keeps: each sees a part of the pixels alone.
@@ -331,8 +333,9 @@ impl Level {
         state.take(fits);
     }
 
-    /// `state` after so many `steps` of cross-validation: pixels held out in turn are explained better and better by the luminance that is solved
-    /// from the others. The frames `still` do not move. `None` as for [`at_coarsest`].
+    /// `state` after at most so many `steps` of cross-validation: pixels held out in turn are explained better and better by the luminance that is solved
+    /// from the others. In time the TSFs follow the noise of those as well: what explains pixels best that no step has seen is kept. The frames `still` do
+    /// not move. `None` as for [`at_coarsest`].
     fn validated(&self, state: &State, still: &[usize], steps: usize, going: &mut dyn FnMut() -> bool) -> Option<State> {
         let (w, n) = (self.size.0, self.held.len());
         let effort = Effort { lambda: LAMBDA, outer: 1, inner: SOLVED, model_error: MODEL_ERROR.1 };
@@ -343,6 +346,7 @@ impl Level {
         }
         let mut strides = self.strides();
         let mut mean = now.clone();
+        let mut best = (geometric_mean(&self.judge(state)), state.clone());
         // Where the last step began, the residuals of each part when it was last held out, and the least of all.
         let mut left = (now.clone(), mean.clone());
         let (mut last, mut least) = ([None; FOLDS], f64::INFINITY);
@@ -379,9 +383,13 @@ impl Level {
                 mean.move_towards(tsf, 1.0 - OLDER);
             }
             mean.latent.clone_from(&now.latent);
+            if (k + 1).is_multiple_of(CHECKED) {
+                let mut settled = mean.clone();
+                self.settle(&mut settled);
+                best = better(Some(best), (geometric_mean(&self.judge(&settled)), settled));
+            }
         }
-        self.settle(&mut mean);
-        Some(mean)
+        Some(best.1)
     }
 
     /// First strides: a Hessian of one frame alone knows nothing of how the luminance follows it, and with that the residuals of all others. The part that a
