@@ -126,6 +126,9 @@ const FIRST_ROSE: f64 = 1.5;
 const LARGEST: usize = 500_000;
 /// Rounds with drawn scenes at the coarsest level and at the next.
 const DRAWN_ROUNDS: (usize, usize) = (5, 5);
+/// Residuals of TSFs fitted to drawn scenes over those of others, up to which the drawn ones are gone on with: too long a blur costs more than one that is
+/// too short.
+const CLEARLY: f64 = 0.95;
 /// Rounds of those at the coarsest level before smoothness falls.
 const SEARCH: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
@@ -720,8 +723,8 @@ pub fn estimate(
             ways.push(Way { fitted_to, held_out });
             held_out
         };
-        let best = (judged(FittedTo::Best, &best), (best, None));
-        let fitted = better(Some(best), (judged(FittedTo::Drawn, &drawn), (drawn, Some(random))));
+        let (with_best, with_drawn) = (judged(FittedTo::Best, &best), judged(FittedTo::Drawn, &drawn));
+        let fitted = if with_drawn < CLEARLY * with_best { (with_drawn, (drawn, Some(random))) } else { (with_best, (best, None)) };
         let unseen = level.validated(&fitted.1.0, &[], STEPS.0, &mut || advance(scale))?;
         let (_, (state, draws)) = better(Some(fitted), (judged(FittedTo::Unseen, &unseen), (unseen, Some(Random::new(SEED, 3)))));
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
