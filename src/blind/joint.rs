@@ -39,8 +39,7 @@ pub struct Joint {
     pub held_out_merge: Vec<f64>,
     /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
     pub if_still: f64,
-    /// What TSFs were fitted to at the second level, the best first, with which the estimate went on; none where there is one level, and where frames in
-    /// doubt stood still.
+    /// What TSFs were fitted to at the second level, the least residual first; none where there is one level, and where frames in doubt stood still.
     pub ways: Vec<Way>,
 }
 
@@ -126,10 +125,10 @@ const FIRST_ROSE: f64 = 1.5;
 const LARGEST: usize = 500_000;
 /// Rounds with drawn scenes at the coarsest level and at the next.
 const DRAWN_ROUNDS: (usize, usize) = (5, 5);
-/// Residuals of TSFs fitted to drawn scenes over those of others, up to which the drawn ones are gone on with: too long a blur costs more than one that is
-/// too short.
+/// Residuals of TSFs fitted to drawn scenes, over those of TSFs fitted to the best one, below which they are gone on with: too long a blur costs more than
+/// one that is too short.
 const CLEARLY: f64 = 0.95;
-/// Rounds of those at the coarsest level before smoothness falls.
+/// Rounds of luminance and TSFs at the coarsest level before smoothness falls.
 const SEARCH: usize = 4;
 /// λ at the end; at the coarsest level it starts six times higher, at finer ones twice.
 const LAMBDA: f32 = 3.0;
