@@ -347,7 +347,7 @@ impl Level {
             *tsf = tsf::divided(tsf, self.size);
         }
         let mut strides = self.strides();
-        let mut mean = now.clone();
+        let mut mean = now.tsfs.clone();
         let mut best = (geometric_mean(&self.judge(state)), state.clone());
         // Where the last step began, the residuals of each part when it was last held out, and the least of all.
         let mut left = (now.clone(), mean.clone());
@@ -381,12 +381,11 @@ impl Level {
                 // Those that do not move say where the scene is.
                 now.replace(stepped);
             }
-            for (mean, tsf) in mean.tsfs.iter_mut().zip(&now.tsfs) {
+            for (mean, tsf) in mean.iter_mut().zip(&now.tsfs) {
                 mean.move_towards(tsf, 1.0 - OLDER);
             }
-            mean.latent.clone_from(&now.latent);
             if (k + 1).is_multiple_of(CHECKED) {
-                let mut settled = mean.clone();
+                let mut settled = State { tsfs: mean.clone(), ..now.clone() };
                 self.settle(&mut settled);
                 best = better(Some(best), (geometric_mean(&self.judge(&settled)), settled));
             }
