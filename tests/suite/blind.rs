@@ -170,6 +170,25 @@ fn scene_and_shakes_are_found_together() {
     }
 }
 
+/// Whichever comes first.
+#[test]
+fn of_two_starts_the_one_that_explains_more_goes_on() {
+    let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
+    let merged = mean(&frames);
+    let residual = |references: &[usize]| {
+        let starts: Vec<Start> =
+            references.iter().map(|&reference| Start { reference, luminance: frames[reference].blurred.clone() }).collect();
+        let found = blind::estimate(&frames, &starts, None, &all_moved(), (&merged, &still()), &mut |_| true).unwrap();
+        (found.reference, blind::geometric_mean(&found.held_out))
+    };
+    let alone = [residual(&[0]), residual(&[2])];
+    let better = if alone[0].1 < alone[1].1 { alone[0] } else { alone[1] };
+    println!("{alone:?}");
+    assert!((alone[0].1 / alone[1].1).ln().abs() > 0.05, "the starts differ: {alone:?}");
+    assert_eq!(residual(&[0, 2]), better);
+    assert_eq!(residual(&[2, 0]), better);
+}
+
 #[test]
 fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
