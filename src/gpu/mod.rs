@@ -44,6 +44,8 @@ pub struct Gpu {
     memory_limit: u64,
     /// Bytes of planes made since [`Gpu::start_count`].
     counted: AtomicU64,
+    /// Bytes of uploads since the device was waited for.
+    uploading: AtomicU64,
     /// Where others draw on the same device.
     turns: Option<Turns>,
 }
@@ -97,6 +99,11 @@ const TURN: Duration = Duration::from_millis(15);
 const FEWEST: usize = 24;
 /// Beyond this it is the steps themselves that take long.
 const LONG: Duration = Duration::from_millis(250);
+/// Bytes up to which memory for small buffers is taken at once. Larger ones have memory of their own: in the blocks of 256 MiB that are usual, two planes of
+/// 96 MiB find room and a third does not, so that a plan for 6.1 GB took 8.3.
+const MEMORY_BLOCK: u64 = 4 << 20;
+/// Bytes of uploads under way at a time: until the device has fetched them they take memory of their own, of the device's where that is mapped.
+const UPLOADS: u64 = 64 << 20;
 /// [`Gpu::dispatch_budget`] of a software rasteriser: lavapipe on two cores makes about 1e9 pixels times taps per second; 0.4 s.
 const BUDGET_CPU: f64 = 4e8;
 /// Of a GPU: the slowest integrated ones make about 2e10; 50 ms.
@@ -141,7 +148,8 @@ pub fn device_descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'sta
         max_compute_workgroup_storage_size: available.max_compute_workgroup_storage_size.min(WORKGROUP_BYTES),
         ..wgpu::Limits::default()
     };
-    wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, ..Default::default() }
+    let memory_hints = wgpu::MemoryHints::Manual { suballocated_device_memory_block_size: MEMORY_BLOCK..MEMORY_BLOCK };
+    wgpu::DeviceDescriptor { label: Some("unshaken"), required_limits: limits, memory_hints, ..Default::default() }
 }
 
 /// The adapters of this machine in order of preference.
@@ -195,6 +203,7 @@ impl Gpu {
             binding_limit,
             memory_limit: u64::MAX,
             counted: AtomicU64::new(0),
+            uploading: AtomicU64::new(0),
             turns: None,
         }
     }
@@ -214,6 +223,7 @@ impl Gpu {
             description: self.description.clone(),
             software,
             counted: AtomicU64::new(0),
+            uploading: AtomicU64::new(0),
             turns: None,
             ..*self
         }
@@ -227,6 +237,11 @@ impl Gpu {
     /// Forgets the planes made so far, which whoever made them has given back.
     pub fn start_count(&self) {
         self.counted.store(0, Ordering::Relaxed);
+    }
+
+    /// Bytes that the device has given for everything that is alive, where the backend tells (Vulkan and Direct3D 12 do).
+    pub fn taken(&self) -> Option<u64> {
+        self.device.generate_allocator_report().map(|report| report.total_reserved_bytes)
     }
 
     /// Bytes of planes made since [`Gpu::start_count`].
@@ -377,8 +392,23 @@ impl Gpu {
     pub fn upload(&self, label: &str, values: &[f32]) -> Result<wgpu::Buffer> {
         finite(label, values)?;
         let buffer = self.plane(label, values.len())?;
-        self.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(values));
+        self.write(&buffer, values);
         Ok(buffer)
+    }
+
+    /// Puts `values` at the start of `buffer`, in pieces, and waits for the device before more than [`UPLOADS`] are under way.
+    fn write(&self, buffer: &wgpu::Buffer, values: &[f32]) {
+        let bytes: &[u8] = bytemuck::cast_slice(values);
+        for (n, piece) in bytes.chunks(UPLOADS as usize).enumerate() {
+            let size = piece.len() as u64;
+            if self.uploading.fetch_add(size, Ordering::Relaxed) + size > UPLOADS {
+                self.uploading.store(size, Ordering::Relaxed);
+                let index = self.pass(None);
+                // A device that does not answer is noticed, and told, where results are read.
+                let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
+            }
+            self.queue.write_buffer(buffer, n as u64 * UPLOADS, piece);
+        }
     }
 
     /// A uniform buffer that holds `bytes`.
@@ -405,10 +435,10 @@ impl Gpu {
                 kernel::record(part, &mut encoder);
                 for step in part {
                     if let Step::Upload(values, buffer) = step {
-                        self.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
+                        self.write(buffer, values);
                     }
                 }
-                let index = self.pass(encoder.finish());
+                let index = self.pass(Some(encoder.finish()));
                 if let Some(turns) = &self.turns {
                     self.next_turn(turns, part.len(), index);
                 }
@@ -416,9 +446,9 @@ impl Gpu {
         }
     }
 
-    fn pass(&self, commands: wgpu::CommandBuffer) -> wgpu::SubmissionIndex {
+    fn pass(&self, commands: Option<wgpu::CommandBuffer>) -> wgpu::SubmissionIndex {
         let _held = self.turns.as_ref().map(|t| t.gate.pass());
-        self.queue.submit([commands])
+        self.queue.submit(commands)
     }
 
     /// Waits for the turn before the one that was just submitted, and makes the next as long as a turn should be.

@@ -22,7 +22,7 @@ pub fn read(gpu: &Gpu, buffer: &wgpu::Buffer, count: usize) -> Result<Vec<f32>> 
     });
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
-    let index = gpu.pass(encoder.finish());
+    let index = gpu.pass(Some(encoder.finish()));
     let (sender, receiver) = mpsc::channel();
     staging.map_async(wgpu::MapMode::Read, .., move |r| {
         // The receiver is gone only when the wait below has failed already.

@@ -97,6 +97,23 @@ fn less_memory(gpu: &Gpu) {
     assert!(error.contains("MiB") && error.contains("--memory-limit") && error.contains("--scale"), "{error}");
 }
 
+#[test]
+fn the_device_gives_little_more_than_is_planned() {
+    // A device of its own: others' planes would count.
+    let gpu = Gpu::new().expect("an adapter");
+    let Some(before) = gpu.taken() else { return };
+    let values = vec![0.5f32; 10 << 20];
+    let planes: Vec<_> = (0..7).map(|_| gpu.upload("plane", &values).expect("there is room")).collect();
+    let taken = gpu.taken().expect("told before") - before;
+    // 40 MiB each, and what is on its way to them: 64 MiB, and as much that has arrived.
+    assert_eq!(gpu.counted(), 280 << 20);
+    assert!(taken < (280 + 128 + 16) << 20, "{} MiB for {}", taken >> 20, gpu.counted() >> 20);
+    let last = unshaken::gpu::read(&gpu, &planes[6], values.len()).expect("reads");
+    assert!(last == values, "arrives whole, in pieces or not");
+    let taken = gpu.taken().expect("told before") - before;
+    assert!(taken < (280 + 40 + 16) << 20, "{} MiB for {} once all has arrived, and one plane was read", taken >> 20, gpu.counted() >> 20);
+}
+
 /// By the plan that `less_memory_gives_the_same_irradiance` holds against what is made.
 #[test]
 fn large_brackets_fit_the_memory_that_there_is() {
