@@ -6,6 +6,7 @@ use crate::image::{Channels, Rgb};
 use crate::mask;
 use crate::merge::gradient_level;
 use crate::noise::NoiseModel;
+use rayon::prelude::*;
 
 /// Error of an operator as a part of the structure around a pixel: structure beyond its inverse, in units of the noise, tells no more.
 const MODEL_ERROR: f64 = 0.1;
@@ -29,7 +30,7 @@ fn known<'a>(frames: impl Iterator<Item = &'a Frame>, size: (usize, usize), chan
 
 /// What the mean of `channels` of an exposure (1 = white) tells about its blur: the sum over the pixels `seen` of squared gradients in units of the
 /// noise, as far as they count.
-fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: impl Fn(usize) -> bool) -> f64 {
+fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: impl Fn(usize) -> bool + Sync) -> f64 {
     let mean = exposure.mean_of(channels);
     let structure = gradient_level(&mean, AROUND);
     let one = |p: usize| {
@@ -37,7 +38,8 @@ fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: imp
         let signal = (f64::from(structure.data[p]).powi(2) - NOISE_GRADIENT * variance).max(0.0);
         signal / (variance + MODEL_ERROR.powi(2) * signal)
     };
-    (0..mean.data.len()).filter(|&p| seen(p)).map(one).sum()
+    let row = |y: usize| -> f64 { (y * mean.width..(y + 1) * mean.width).filter(|&p| seen(p)).map(one).sum() };
+    (0..mean.height).into_par_iter().map(row).collect::<Vec<f64>>().into_iter().sum()
 }
 
 /// The channels whose mean tells most about the blurs of the frames `blurred` (no frame's is bought with another's), the scene being known from

@@ -11,6 +11,7 @@
 //! opponent space, in stacks that the sum of the channels chooses.
 
 use crate::image::{Plane, Rgb};
+use crate::sampling::wide;
 use rayon::prelude::*;
 
 /// Side of a patch in pixels.
@@ -32,8 +33,8 @@ pub const THRESHOLD: f32 = 2.7;
 pub const UNKNOWN: f32 = 1.0;
 /// Rows of patches that one task filters: fixed, so that the sums do not depend on the number of processors.
 const BAND: usize = 16;
-/// Tasks whose results are held at once.
-const BATCH: usize = 8;
+/// Tasks of each thread whose results are held at once.
+const EACH: usize = 2;
 
 /// Inverse variance of the values, pixel by pixel.
 pub struct Precision {
@@ -44,41 +45,38 @@ pub struct Precision {
 }
 
 /// Orthonormal DCT-II of one dimension: row k is frequency k.
-fn dct() -> [[f32; SIDE]; SIDE] {
+fn dct() -> Patch {
     let n = SIDE as f64;
-    std::array::from_fn(|k| {
+    std::array::from_fn(|p| {
+        let (k, i) = (p / SIDE, p % SIDE);
         let a = if k == 0 { 1.0 / n } else { 2.0 / n };
-        std::array::from_fn(|i| (a.sqrt() * (std::f64::consts::PI * (i as f64 + 0.5) * k as f64 / n).cos()) as f32)
+        (a.sqrt() * (std::f64::consts::PI * (i as f64 + 0.5) * k as f64 / n).cos()) as f32
     })
 }
 
-/// `m p mᵀ`.
-fn transform(m: &[[f32; SIDE]; SIDE], p: &Patch) -> Patch {
-    let (mut rows, mut out) = ([0f32; VALUES], [0f32; VALUES]);
+/// The product of two square matrices.
+#[inline(always)]
+fn product(a: &Patch, b: &Patch) -> Patch {
+    let mut out = [0f32; VALUES];
     for y in 0..SIDE {
+        let mut row = [0f32; SIDE];
         for i in 0..SIDE {
+            let factor = a[y * SIDE + i];
             for x in 0..SIDE {
-                rows[y * SIDE + x] += m[y][i] * p[i * SIDE + x];
+                row[x] += factor * b[i * SIDE + x];
             }
         }
-    }
-    for y in 0..SIDE {
-        for i in 0..SIDE {
-            for x in 0..SIDE {
-                out[y * SIDE + x] += rows[y * SIDE + i] * m[x][i];
-            }
-        }
+        out[y * SIDE..(y + 1) * SIDE].copy_from_slice(&row);
     }
     out
 }
 
 /// Orthonormal Haar transform along a stack of a power of two of patches, or its inverse; `spare` is as long as the stack.
+#[inline(always)]
 fn haar(stack: &mut [Patch], spare: &mut [Patch], inverse: bool) {
-    let mut lengths: Vec<usize> = std::iter::successors(Some(stack.len()), |n| Some(n / 2)).take_while(|n| *n >= 2).collect();
-    if inverse {
-        lengths.reverse();
-    }
-    for n in lengths {
+    let levels = stack.len().ilog2();
+    for level in 0..levels {
+        let n = if inverse { 2 << level } else { stack.len() >> level };
         for i in 0..n / 2 {
             let (from, to) = if inverse { ([i, n / 2 + i], [2 * i, 2 * i + 1]) } else { ([2 * i, 2 * i + 1], [i, n / 2 + i]) };
             for k in 0..VALUES {
@@ -125,6 +123,7 @@ fn places(length: usize) -> Vec<usize> {
     (0..last).step_by(STEP).chain([last]).collect()
 }
 
+#[inline(always)]
 fn patch(plane: &Plane, (x, y): (usize, usize)) -> Patch {
     let mut p = [0f32; VALUES];
     for (j, row) in p.chunks_exact_mut(SIDE).enumerate() {
@@ -163,50 +162,78 @@ struct Pass<'a> {
     basic: Option<&'a Rgb>,
     precision: &'a Precision,
     strength: f32,
-    dct: [[f32; SIDE]; SIDE],
-    inverse: [[f32; SIDE]; SIDE],
+    dct: Patch,
+    inverse: Patch,
     opponent: [[f32; 3]; 3],
     window: Patch,
 }
 
 impl Pass<'_> {
-    /// Variances of the coefficients of the patch at `at`, by opponent channel.
-    fn variances(&self, at: (usize, usize)) -> [Patch; 3] {
-        let mean = |plane: &Plane| patch(plane, at).iter().sum::<f32>() / VALUES as f32;
-        let channels: [Patch; 3] = std::array::from_fn(|c| {
-            let mut precision = [mean(&self.precision.white.0[c]); VALUES];
-            for (given, power) in &self.precision.shaken {
-                let given = mean(&given.0[c]);
-                precision.iter_mut().zip(power).for_each(|(p, power)| *p += given * power);
+    /// Mean of the patch of `plane` at `at`.
+    #[inline(always)]
+    fn mean(plane: &Plane, at: (usize, usize)) -> f32 {
+        let own = patch(plane, at);
+        let mut columns = [0f32; SIDE];
+        for row in own.chunks_exact(SIDE) {
+            for i in 0..SIDE {
+                columns[i] += row[i];
             }
-            precision.map(|p| self.strength * self.strength / p.max(1.0 / (UNKNOWN * UNKNOWN)))
-        });
-        self.opponent.map(|row| std::array::from_fn(|k| (0..3).map(|c| row[c] * row[c] * channels[c][k]).sum()))
+        }
+        columns.iter().sum::<f32>() / VALUES as f32
     }
 
-    /// Places of the patches most like that at `at`, the likest first: that itself, and a power of two of them.
-    fn alike(&self, at: (usize, usize)) -> Vec<(usize, usize)> {
+    /// Variances of the coefficients of the patch at `at`, by opponent channel.
+    #[inline(always)]
+    fn variances(&self, at: (usize, usize)) -> [Patch; 3] {
+        let mut channels = [[0f32; VALUES]; 3];
+        for (c, channel) in channels.iter_mut().enumerate() {
+            *channel = [Self::mean(&self.precision.white.0[c], at); VALUES];
+            for (given, power) in &self.precision.shaken {
+                let given = Self::mean(&given.0[c], at);
+                for k in 0..VALUES {
+                    channel[k] += given * power[k];
+                }
+            }
+            for k in 0..VALUES {
+                channel[k] = self.strength * self.strength / channel[k].max(1.0 / (UNKNOWN * UNKNOWN));
+            }
+        }
+        let mut mixed = [[0f32; VALUES]; 3];
+        for (out, row) in mixed.iter_mut().zip(&self.opponent) {
+            for k in 0..VALUES {
+                out[k] = row[0] * row[0] * channels[0][k] + row[1] * row[1] * channels[1][k] + row[2] * row[2] * channels[2][k];
+            }
+        }
+        mixed
+    }
+
+    /// Puts the places of the patches most like that at `at` into `best`, the likest first: that itself, and a power of two of them.
+    #[inline(always)]
+    fn alike(&self, at: (usize, usize), best: &mut Vec<(f32, (usize, usize))>) {
         let plane = &self.basic.unwrap_or(self.noisy).0[0];
         let most = STACK[usize::from(self.basic.is_some())];
         let own = patch(plane, at);
-        let mut best: Vec<(f32, (usize, usize))> = vec![(0.0, at)];
+        best.clear();
+        best.push((0.0, at));
+        let mut limit = f32::INFINITY;
         for y in at.1.saturating_sub(REACH)..=(at.1 + REACH).min(plane.height - SIDE) {
             for x in at.0.saturating_sub(REACH)..=(at.0 + REACH).min(plane.width - SIDE) {
                 if (x, y) == at {
                     continue;
                 }
-                let limit = if best.len() < most { f32::INFINITY } else { best[most - 1].0 };
+                let mut squares = [0f32; SIDE];
                 let mut difference = 0.0;
                 // In two halves: most patches are too different after the first.
                 for half in [0, SIDE / 2] {
-                    let mut squares = [0f32; SIDE];
                     for j in half..half + SIDE / 2 {
                         let row = &plane.data[(y + j) * plane.width + x..][..SIDE];
                         for i in 0..SIDE {
-                            squares[i] += (row[i] - own[j * SIDE + i]).powi(2);
+                            let d = row[i] - own[j * SIDE + i];
+                            squares[i] += d * d;
                         }
                     }
-                    difference += squares.iter().sum::<f32>();
+                    let [a, b, c, d, e, f, g, h] = squares;
+                    difference = ((a + e) + (b + f)) + ((c + g) + (d + h));
                     if difference >= limit {
                         break;
                     }
@@ -214,55 +241,77 @@ impl Pass<'_> {
                 if difference < limit {
                     best.truncate(most - 1);
                     best.insert(best.partition_point(|b| b.0 <= difference), (difference, (x, y)));
+                    if best.len() == most {
+                        limit = best[most - 1].0;
+                    }
                 }
             }
         }
         best.truncate(1 << best.len().ilog2());
-        best.into_iter().map(|b| b.1).collect()
     }
 
     /// Shrinks the coefficients of a stack, by those of `known` when it is not empty; returns the variance that is left in it.
+    #[inline(always)]
     fn shrink(stack: &mut [Patch], known: &[Patch], variance: &Patch) -> f32 {
-        let mut left = 0.0;
+        // The mean of the stack is always kept.
+        let (mean, mut gains) = (stack[0][0], [0f32; VALUES]);
         for (n, patch) in stack.iter_mut().enumerate() {
             for k in 0..VALUES {
-                let gain = match known.get(n) {
-                    Some(known) => known[k] * known[k] / (known[k] * known[k] + variance[k]),
-                    // The mean of the stack is always kept.
-                    None => f32::from(patch[k] * patch[k] > THRESHOLD * THRESHOLD * variance[k] || (n, k) == (0, 0)),
+                let gain = if known.is_empty() {
+                    if patch[k] * patch[k] > THRESHOLD * THRESHOLD * variance[k] { 1.0 } else { 0.0 }
+                } else {
+                    known[n][k] * known[n][k] / (known[n][k] * known[n][k] + variance[k])
                 };
                 patch[k] *= gain;
-                left += gain * gain * variance[k];
+                gains[k] += gain * gain;
             }
         }
-        left
+        if known.is_empty() && stack[0][0] == 0.0 {
+            stack[0][0] = mean;
+            gains[0] += 1.0;
+        }
+        (0..VALUES).map(|k| gains[k] * variance[k]).sum()
     }
 
+    /// The transform of the patches of `plane` at `places`.
+    #[inline(always)]
+    fn transformed(&self, plane: &Plane, places: &[(f32, (usize, usize))], stack: &mut [Patch], spare: &mut [Patch]) {
+        for (patch_of, place) in stack.iter_mut().zip(places) {
+            *patch_of = product(&product(&self.dct, &patch(plane, place.1)), &self.inverse);
+        }
+        haar(stack, spare, false);
+    }
+
+    #[inline(always)]
     fn band(&self, rows: &[usize], columns: &[usize]) -> Sums {
         let (width, height) = self.noisy.size();
         let mut sums = Sums::new(width, rows[0].saturating_sub(REACH)..(rows[rows.len() - 1] + REACH + SIDE).min(height));
-        let mut spare = vec![[0f32; VALUES]; STACK[1]];
-        for at in rows.iter().flat_map(|&y| columns.iter().map(move |&x| (x, y))) {
-            let places = self.alike(at);
-            let variances = self.variances(at);
-            for (c, variance) in variances.iter().enumerate() {
-                let mut transformed = |plane: &Plane| {
-                    let mut stack: Vec<Patch> = places.iter().map(|&p| transform(&self.dct, &patch(plane, p))).collect();
-                    haar(&mut stack, &mut spare, false);
-                    stack
-                };
-                let mut stack = transformed(&self.noisy.0[c]);
-                let known = self.basic.map_or(Vec::new(), |b| transformed(&b.0[c]));
-                let weight = 1.0 / Self::shrink(&mut stack, &known, variance).max(f32::MIN_POSITIVE);
-                haar(&mut stack, &mut spare, true);
-                for (&(x, y), coefficients) in places.iter().zip(&stack) {
-                    let p = transform(&self.inverse, coefficients);
-                    for j in 0..SIDE {
-                        let row = (y + j - sums.first) * width + x;
-                        for i in 0..SIDE {
-                            let w = weight * self.window[j * SIDE + i];
-                            sums.values.0[c].data[row + i] += w * p[j * SIDE + i];
-                            sums.weights.0[c].data[row + i] += w;
+        let [mut spare, mut stack, mut known] = [(); 3].map(|()| vec![[0f32; VALUES]; STACK[1]]);
+        let mut places = Vec::with_capacity(STACK[1]);
+        for &y in rows {
+            for &x in columns {
+                self.alike((x, y), &mut places);
+                let stack = &mut stack[..places.len()];
+                let known = &mut known[..if self.basic.is_some() { places.len() } else { 0 }];
+                let variances = self.variances((x, y));
+                for c in 0..3 {
+                    self.transformed(&self.noisy.0[c], &places, stack, &mut spare);
+                    if let Some(basic) = self.basic {
+                        self.transformed(&basic.0[c], &places, known, &mut spare);
+                    }
+                    let weight = 1.0 / Self::shrink(stack, known, &variances[c]).max(f32::MIN_POSITIVE);
+                    haar(stack, &mut spare, true);
+                    for (&(_, (x, y)), coefficients) in places.iter().zip(stack.iter()) {
+                        let p = product(&product(&self.inverse, coefficients), &self.dct);
+                        for j in 0..SIDE {
+                            let row = (y + j - sums.first) * width + x;
+                            let values = &mut sums.values.0[c].data[row..row + SIDE];
+                            let weights = &mut sums.weights.0[c].data[row..row + SIDE];
+                            for i in 0..SIDE {
+                                let w = weight * self.window[j * SIDE + i];
+                                values[i] += w * p[j * SIDE + i];
+                                weights[i] += w;
+                            }
                         }
                     }
                 }
@@ -275,10 +324,17 @@ impl Pass<'_> {
         let (width, height) = self.noisy.size();
         let (rows, columns) = (places(height), places(width));
         let mut sums = Sums::new(width, 0..height);
-        for (n, batch) in rows.chunks(BAND * BATCH).enumerate() {
-            let parts: Vec<Sums> = batch.par_chunks(BAND).map(|band| self.band(band, &columns)).collect();
+        let batch = BAND * rayon::current_num_threads() * EACH;
+        for (n, some) in rows.chunks(batch).enumerate() {
+            let of = |band: &[usize]| {
+                wide(
+                    #[inline(always)]
+                    || self.band(band, &columns),
+                )
+            };
+            let parts: Vec<Sums> = some.par_chunks(BAND).map(of).collect();
             parts.iter().for_each(|part| sums.add(part));
-            if !progress(((n + 1) * BAND * BATCH) as f32 / rows.len() as f32) {
+            if !progress(((n + 1) * batch) as f32 / rows.len() as f32) {
                 return None;
             }
         }
@@ -300,7 +356,7 @@ pub fn filtered(image: &Rgb, precision: &Precision, strength: f32, progress: &mu
     }
     let (dct, opponent) = (dct(), opponent());
     let noisy = mixed(image, &opponent);
-    let inverse = std::array::from_fn(|i| std::array::from_fn(|k| dct[k][i]));
+    let inverse = std::array::from_fn(|p| dct[p % SIDE * SIDE + p / SIDE]);
     let mut pass = Pass { noisy: &noisy, basic: None, precision, strength, dct, inverse, opponent, window: window() };
     let basic = pass.run(&mut |f| progress(0.4 * f.min(1.0)))?;
     pass.basic = Some(&basic);

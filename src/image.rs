@@ -32,6 +32,21 @@ impl Channels {
     }
 }
 
+/// Values from which several threads share the work.
+const LARGE: usize = 1 << 16;
+/// Rows of a band of [`Plane::box_sum`].
+const BAND: usize = 128;
+
+/// Calls `f` with each row of `data`, of `width` values, and its number.
+fn in_rows(data: &mut [f32], width: usize, f: impl Fn(usize, &mut [f32]) + Sync) {
+    let width = width.max(1);
+    if data.len() < LARGE {
+        data.chunks_exact_mut(width).enumerate().for_each(|(y, row)| f(y, row));
+    } else {
+        data.par_chunks_exact_mut(width).enumerate().for_each(|(y, row)| f(y, row));
+    }
+}
+
 /// One channel, `width * height` values, row-major, pixel centres at integers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plane {
@@ -49,14 +64,16 @@ impl Plane {
         Self { width, height, data: vec![value; width * height] }
     }
 
-    /// A plane whose value at (x, y) is `f(x, y)`.
-    pub fn from_fn(width: usize, height: usize, mut f: impl FnMut(usize, usize) -> f32) -> Self {
-        let mut data = Vec::with_capacity(width * height);
-        for y in 0..height {
-            for x in 0..width {
-                data.push(f(x, y));
-            }
-        }
+    /// A plane whose value at (x, y) is `f(x, y)`, which several threads ask for where it is large.
+    pub fn from_fn(width: usize, height: usize, f: impl Fn(usize, usize) -> f32 + Sync) -> Self {
+        let mut data = vec![0.0; width * height];
+        in_rows(&mut data, width, |y, row| row.iter_mut().enumerate().for_each(|(x, v)| *v = f(x, y)));
+        Self { width, height, data }
+    }
+
+    /// A plane whose value at (x, y) is `f(x, y)`, called for one pixel after the other, row by row.
+    pub fn in_order(width: usize, height: usize, mut f: impl FnMut(usize, usize) -> f32) -> Self {
+        let data = (0..width * height).map(|p| f(p % width, p / width)).collect();
         Self { width, height, data }
     }
 
@@ -84,17 +101,21 @@ impl Plane {
     }
 
     /// A new plane with `f` applied to each value.
-    pub fn map(&self, mut f: impl FnMut(f32) -> f32) -> Self {
-        Self { width: self.width, height: self.height, data: self.data.iter().map(|&v| f(v)).collect() }
+    pub fn map(&self, f: impl Fn(f32) -> f32 + Sync) -> Self {
+        let mut data = self.data.clone();
+        in_rows(&mut data, self.width, |_, row| row.iter_mut().for_each(|v| *v = f(*v)));
+        Self { width: self.width, height: self.height, data }
     }
 
     /// A new plane with `f` applied to each pair of values.
     ///
     /// # Panics
     /// When the sizes differ.
-    pub fn zip(&self, other: &Self, mut f: impl FnMut(f32, f32) -> f32) -> Self {
+    pub fn zip(&self, other: &Self, f: impl Fn(f32, f32) -> f32 + Sync) -> Self {
         assert_eq!(self.size(), other.size(), "planes of one size");
-        Self { width: self.width, height: self.height, data: self.data.iter().zip(&other.data).map(|(&a, &b)| f(a, b)).collect() }
+        let (w, mut data) = (self.width, self.data.clone());
+        in_rows(&mut data, w, |y, row| row.iter_mut().zip(&other.data[y * w..]).for_each(|(a, &b)| *a = f(*a, b)));
+        Self { width: w, height: self.height, data }
     }
 
     /// (width, height).
@@ -139,19 +160,24 @@ impl Plane {
             }
         });
         let mut out = rows.clone();
-        let mut sum = vec![0.0f32; w];
-        for y in 0..r.min(h) {
-            sum.iter_mut().zip(&rows.data[y * w..(y + 1) * w]).for_each(|(s, v)| *s += v);
-        }
-        for y in 0..h {
-            if y + r < h {
-                sum.iter_mut().zip(&rows.data[(y + r) * w..(y + r + 1) * w]).for_each(|(s, v)| *s += v);
+        // Bands of rows that do not depend on the number of threads, and sums with them.
+        out.data.par_chunks_mut(BAND * w.max(1)).enumerate().for_each(|(n, out)| {
+            let first = n * BAND;
+            let row = |y: usize| &rows.data[y * w..(y + 1) * w];
+            let mut sum = vec![0.0f32; w];
+            for y in first.saturating_sub(r)..(first + r).min(h) {
+                sum.iter_mut().zip(row(y)).for_each(|(s, v)| *s += v);
             }
-            out.data[y * w..(y + 1) * w].copy_from_slice(&sum);
-            if y >= r {
-                sum.iter_mut().zip(&rows.data[(y - r) * w..(y - r + 1) * w]).for_each(|(s, v)| *s -= v);
+            for (y, out) in (first..).zip(out.chunks_exact_mut(w.max(1))) {
+                if y + r < h {
+                    sum.iter_mut().zip(row(y + r)).for_each(|(s, v)| *s += v);
+                }
+                out.copy_from_slice(&sum);
+                if y >= r {
+                    sum.iter_mut().zip(row(y - r)).for_each(|(s, v)| *s -= v);
+                }
             }
-        }
+        });
         out
     }
 

@@ -4,6 +4,7 @@ use crate::exposure::Frame;
 use crate::image::{Channels, Plane};
 use crate::pose::nearest_pixel;
 use glam::DMat3;
+use rayon::prelude::*;
 
 /// Intensity from which a channel counts as clipped: the well clips after the noise, so that values just below white are
 /// already biased. 250 of 255.
@@ -33,7 +34,7 @@ fn grey(frame: &Frame, channels: Channels) -> Plane {
 /// Where any of `channels` of the frame is clipped.
 pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
     let planes = &frame.intensity.0;
-    (0..planes[0].data.len()).map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
+    (0..planes[0].data.len()).into_par_iter().map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
 }
 
 /// `mask`, which is 0 where any channel of `frame` is clipped, for those who take each channel by itself: where some are clipped and others are
@@ -45,7 +46,7 @@ pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: f32) 
         1 | 2 => share * low_taper(1.0 - grey.data[p], alpha),
         _ => mask.data[p],
     };
-    Plane { data: (0..mask.data.len()).map(one).collect(), ..grey }
+    Plane { data: (0..mask.data.len()).into_par_iter().map(one).collect(), ..grey }
 }
 
 /// [`masks`] of all channels, each frame's [`with_partly_clipped`]: how frames count in the solver.
@@ -59,10 +60,9 @@ pub const UNKNOWN: usize = 10;
 
 /// Pixels of a frame of `size` farther than `radius`, along rows and columns, from those where `lost` is true.
 pub fn apart(lost: &[bool], size: (usize, usize), radius: usize) -> Vec<bool> {
-    let (w, h) = size;
-    let near = |v: usize, n: usize| v.saturating_sub(radius)..=(v + radius).min(n - 1);
-    let rows: Vec<bool> = (0..w * h).map(|p| near(p % w, w).any(|x| lost[p / w * w + x])).collect();
-    (0..w * h).map(|p| !near(p / w, h).any(|y| rows[y * w + p % w])).collect()
+    let lost = Plane { width: size.0, height: size.1, data: lost.iter().map(|&l| f32::from(l)).collect() };
+    // Counts of at most (2 radius + 1)² are whole numbers in f32, whatever is added and taken away before.
+    lost.box_sum(radius).data.into_iter().map(|count| count < 0.5).collect()
 }
 
 /// One mask per frame, 0..=1, for all of `channels` together.
@@ -85,6 +85,7 @@ pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3], ch
             let to: Vec<(usize, Option<DMat3>)> =
                 better.into_iter().map(|j| (j, (motions[j] != motions[i]).then(|| motions[j] * motions[i].inverse()))).collect();
             let data = (0..greys[i].data.len())
+                .into_par_iter()
                 .map(|p| {
                     if clipped[i][p] {
                         return 0.0;

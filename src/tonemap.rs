@@ -95,10 +95,9 @@ impl ToneMap {
 
 /// Relative luminance (Rec. 709), 0 where it is not a finite positive number.
 fn luminance(image: &Rgb) -> Plane {
-    let mut i = 0;
-    image.0[0].map(|_| {
-        let [r, g, b] = image.pixel(i).map(|v| if v.is_finite() { v.clamp(0.0, 1e30) } else { 0.0 });
-        i += 1;
+    let (w, h) = image.size();
+    Plane::from_fn(w, h, |x, y| {
+        let [r, g, b] = image.pixel(y * w + x).map(|v| if v.is_finite() { v.clamp(0.0, 1e30) } else { 0.0 });
         0.2126 * r + 0.7152 * g + 0.0722 * b
     })
 }

@@ -860,7 +860,7 @@ mod tests {
         let noise = 0.02f32;
         let mut frame = |tsf: &Tsf| {
             let clean = Operator::new(tsf, w, h, pad).blur(&scene);
-            let blurred = clean.map(|v| v + noise * random.normal() as f32);
+            let blurred = Plane::in_order(w, h, |x, y| clean.at(x, y) + noise * random.normal() as f32);
             Frame { variance: clean.map(|_| noise * noise), mask: clean.map(|_| 1.0), clipped: vec![false; w * h], blurred }
         };
         let frames: Vec<Frame> = tsfs(1.0).iter().map(&mut frame).collect();

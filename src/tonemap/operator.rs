@@ -197,7 +197,7 @@ impl Operator {
     fn exposed(&self, lum: &Plane) -> (Plane, Statistics) {
         let statistics = Statistics::of(lum);
         let gain = self.value("key") / statistics.middle * self.value("exposure").exp2();
-        (map(lum, |v| (v * gain).min(1e12)), Statistics { gain, ..statistics })
+        (lum.map(|v| (v * gain).min(1e12)), Statistics { gain, ..statistics })
     }
 
     fn white(&self, statistics: &Statistics) -> f32 {
@@ -214,14 +214,14 @@ impl Operator {
         let white = self.white(&statistics);
         // The curve turns the key darker than it was: twice the light makes up for it.
         let scale = 1.0 / curve(2.0 * white);
-        map(&exposed, |v| curve(2.0 * v.min(white)) * scale)
+        exposed.map(|v| curve(2.0 * v.min(white)) * scale)
     }
 
     /// E. Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, eq. 4.
     fn reinhard(&self, lum: &Plane) -> Plane {
         let (exposed, statistics) = self.exposed(lum);
         let white = self.white(&statistics);
-        map(&exposed, |v| v * (1.0 + v / (white * white)) / (1.0 + v))
+        exposed.map(|v| v * (1.0 + v / (white * white)) / (1.0 + v))
     }
 
     /// The same, eq. 9: each pixel's shoulder follows the largest surround without strong contrast, of eight sizes that grow by 1.6.
@@ -232,7 +232,7 @@ impl Operator {
         const SCALES: i32 = 8;
         // Before blurring, or a lamp's glow would darken a whole room.
         let limit = (statistics.high * statistics.gain).max(1.0);
-        let limited = map(&exposed, |v| v.min(limit));
+        let limited = exposed.map(|v| v.min(limit));
         let size = |s: i32| RATIO.powi(s);
         let mut centre = filter::gaussian(&limited, 0.35 * size(0));
         let mut adapted = centre.clone();
@@ -252,27 +252,27 @@ impl Operator {
             centre = surround;
         }
         let white = limit;
-        zip(&exposed, &adapted, move |v, around| v * (1.0 + v / (white * white)) / (1.0 + around))
+        exposed.zip(&adapted, move |v, around| v * (1.0 + v / (white * white)) / (1.0 + around))
     }
 
     /// F. Durand and J. Dorsey, "Fast Bilateral Filtering for the Display of High-Dynamic-Range Images", 2002: large areas lose contrast,
     /// detail does not.
     fn durand(&self, lum: &Plane) -> Plane {
         let statistics = Statistics::of(lum);
-        let log = map(lum, |v| v.max(statistics.low).log10());
+        let log = lum.map(|v| v.max(statistics.low).log10());
         let size = (self.value("size") * lum.width.max(lum.height) as f32).max(2.0);
         let base = super::bilateral(&log, size, self.value("range"));
         let (low, high) = extremes(&base.data);
         let slope = (self.value("contrast") / (high - low).max(1e-3)).min(1.0);
         let exposure = self.value("exposure") * std::f32::consts::LOG10_2;
         // The brightest area is white, as in the paper; detail reaches beyond, and is clipped.
-        zip(&log, &base, move |l, b| 10f32.powf(slope * (b - high) + (l - b) + exposure))
+        log.zip(&base, move |l, b| 10f32.powf(slope * (b - high) + (l - b) + exposure))
     }
 
     /// R. Fattal, D. Lischinski and M. Werman, "Gradient Domain High Dynamic Range Compression", 2002.
     fn fattal(&self, lum: &Plane) -> Plane {
         let statistics = Statistics::of(lum);
-        let log = map(lum, |v| v.max(statistics.low).ln());
+        let log = lum.map(|v| v.max(statistics.low).ln());
         let mut shown = fattal::compress(&log, self.value("alpha"), self.value("beta"));
         // The gradients do not know the level: half a percent of the pixels become white, half a percent black.
         let (low, high) = percentiles(&shown.data, 0.005, 0.995);
@@ -280,7 +280,7 @@ impl Operator {
         // What the attenuation took beyond what a screen holds, two decades, is given back.
         let (darkest, brightest) = percentiles(&log.data, 0.005, 0.995);
         let scale = (brightest - darkest).clamp(1e-3, 2.0 * std::f32::consts::LN_10) / (high - low).max(1e-3);
-        shown = map(&shown, move |v| ((v - high) * scale + exposure).exp());
+        shown = shown.map(move |v| ((v - high) * scale + exposure).exp());
         shown
     }
 }
@@ -338,15 +338,6 @@ fn colour(image: &Rgb, lum: &Plane, shown: &Plane, saturation: f32) -> image::Rg
         }
     });
     image::RgbImage::from_raw(width as u32, height as u32, codes).expect("three bytes per pixel")
-}
-
-/// `f` of every value, on all cores.
-fn map(p: &Plane, f: impl Fn(f32) -> f32 + Sync) -> Plane {
-    Plane { width: p.width, height: p.height, data: p.data.par_iter().map(|v| f(*v)).collect() }
-}
-
-fn zip(a: &Plane, b: &Plane, f: impl Fn(f32, f32) -> f32 + Sync) -> Plane {
-    Plane { width: a.width, height: a.height, data: (&a.data, &b.data).into_par_iter().map(|(a, b)| f(*a, *b)).collect() }
 }
 
 fn extremes(values: &[f32]) -> (f32, f32) {

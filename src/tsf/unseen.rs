@@ -182,9 +182,10 @@ mod tests {
         let wave = |x: f64, y: f64, a: f64, b: f64| 1.0 + 0.5 * (a * x).sin() * (b * y + 0.1 * x).cos();
         let scene = |x: f64, y: f64| wave(x, y, 0.5, 0.4);
         let sensitivity = |x: f64, y: f64| wave(x, y, 0.3, 0.6) - 1.0;
-        let sampled = |of: &dyn Fn(f64, f64) -> f64| Plane::from_fn(w, h, |x, y| of(x as f64, y as f64) as f32);
+        let sampled = |of: &(dyn Fn(f64, f64) -> f64 + Sync)| Plane::from_fn(w, h, |x, y| of(x as f64, y as f64) as f32);
         let inner = |x: usize, y: usize| x >= 6 && y >= 6 && x + 6 < size.0 && y + 6 < size.1;
-        let plane = |f: &dyn Fn(usize, usize) -> f32| Plane::from_fn(size.0, size.1, |x, y| if inner(x, y) { f(x, y) } else { 0.0 });
+        let plane =
+            |f: &(dyn Fn(usize, usize) -> f32 + Sync)| Plane::from_fn(size.0, size.1, |x, y| if inner(x, y) { f(x, y) } else { 0.0 });
         let unseen = Unseen {
             direct: plane(&|x, y| ((x * 7 + y * 3) % 5) as f32 - 2.0),
             through: plane(&|x, y| ((x * 3 + y * 5) % 7) as f32 - 3.0),

@@ -22,7 +22,7 @@ fn pair() -> (Rgb, Rgb) {
 }
 
 /// 160 x 120 pixels of a formula of (x, y, channel).
-fn image(f: &dyn Fn(f64, f64, f64) -> f64) -> Rgb {
+fn image(f: &(dyn Fn(f64, f64, f64) -> f64 + Sync)) -> Rgb {
     Rgb(std::array::from_fn(|c| Plane::from_fn(160, 120, |x, y| f(x as f64, y as f64, c as f64) as f32)))
 }
 

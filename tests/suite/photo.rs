@@ -606,7 +606,8 @@ fn a_dng_bracket_is_merged_in_true_colours() {
     let mut noise = crate::support::files::Noise::new(5);
     for (name, time) in [("a.dng", (1, 8)), ("b.dng", (1, 2)), ("c.dng", (2, 1))] {
         let seconds = f64::from(time.0) / f64::from(time.1);
-        let exposed = truth.map_planes(|p| p.map(|v| (f64::from(v) * seconds + 0.002 * noise.normal()) as f32));
+        let exposed = truth
+            .map_planes(|p| Plane::in_order(p.width, p.height, |x, y| (f64::from(p.at(x, y)) * seconds + 0.002 * noise.normal()) as f32));
         let notes = Notes { time: Some(time), artist: Some("A. Person"), taken: Some("2024:05:06 07:08:09"), ..Notes::default() };
         std::fs::write(dir.path().join(name), photos::dng(&exposed, &notes)).unwrap();
     }

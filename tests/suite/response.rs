@@ -61,7 +61,7 @@ fn noisy_bracket(f: fn(f64) -> f64, width: usize, height: usize, full_well: f64,
     let scene = scene(width, height, 3.0);
     let frames = [1.0 / 60.0, 1.0 / 15.0, 0.5].map(|exposure_time| {
         let plane = |gain: f64, noise: &mut Noise| {
-            Plane::from_fn(width, height, |x, y| {
+            Plane::in_order(width, height, |x, y| {
                 let e = f64::from(scene.at(x, y)) * gain * exposure_time * 60.0 * full_well;
                 let e = e + noise.normal() * (e + read_noise * read_noise).sqrt();
                 ((f((e / full_well).clamp(0.0, 1.0)) * 255.0).round() / 255.0) as f32

@@ -189,7 +189,7 @@ fn solved_in_bands(gpu: &Gpu, bytes: u64) {
     assert!(error.contains("150 x 110") && error.contains("--scale"), "{error}");
 }
 
-fn frames(size: (usize, usize), value: impl Fn(usize, usize) -> f32 + Copy) -> Bracket {
+fn frames(size: (usize, usize), value: impl Fn(usize, usize) -> f32 + Copy + Sync) -> Bracket {
     let frame = |name: &str, exposure_time: f64, factor: f32| Frame {
         name: name.into(),
         intensity: Rgb(std::array::from_fn(|_| {

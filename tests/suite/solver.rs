@@ -87,11 +87,7 @@ fn start(pad: usize) -> Rgb {
     truth(pad).map_planes(|p| {
         seed += 1;
         let n = noise(seed, p.data.len());
-        let mut i = 0;
-        p.map(|v| {
-            i += 1;
-            v * (1.1 + 0.1 * n[i - 1])
-        })
+        p.zip(&Plane { data: n, ..p.clone() }, |v, n| v * (1.1 + 0.1 * n))
     })
 }
 

@@ -3,7 +3,7 @@
 use unshaken::image::{Plane, Rgb};
 use unshaken::tonemap::{Operator, ToneMap, preview};
 
-fn grey(width: usize, height: usize, f: impl Fn(usize, usize) -> f32) -> Rgb {
+fn grey(width: usize, height: usize, f: impl Fn(usize, usize) -> f32 + Sync) -> Rgb {
     let plane = Plane::from_fn(width, height, f);
     Rgb([plane.clone(), plane.clone(), plane])
 }
