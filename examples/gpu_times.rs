@@ -63,7 +63,7 @@ fn iteration(gpu: &Gpu, kernels: &Kernels, side: usize, interpolation: Interpola
     let tsf = |f: usize| if f < 2 { moved.clone() } else { Tsf::identity() };
     let frames: Vec<_> = (0..FRAMES).map(|f| observation(side, [values.as_slice(); 3], tsf(f))).collect();
     let start = Rgb::filled(side, side, 0.5);
-    let settings = Settings { outer: 1, inner: 45, interpolation, prior: Prior::Tv, ..Settings::default() };
+    let settings = Settings { outer: 1, inner: 45, reduction: 0.0, interpolation, prior: Prior::Tv, ..Settings::default() };
     let (mut last, mut times) = (Instant::now(), Vec::new());
     deblur::solve(gpu, kernels, &frames, &start, 0, &settings, &mut |_| {
         let now = Instant::now();

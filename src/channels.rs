@@ -11,7 +11,7 @@ use rayon::prelude::*;
 /// Error of an operator as a part of the structure around a pixel: structure beyond its inverse, in units of the noise, tells no more.
 const MODEL_ERROR: f64 = 0.1;
 /// Radius in pixels over which structure is averaged.
-const AROUND: isize = 4;
+const AROUND: usize = 4;
 /// Squared mean gradient of white noise of variance 1.
 const NOISE_GRADIENT: f64 = std::f64::consts::PI;
 /// Part of a frame that some channels have to see beyond what all three see for these to be looked at.

@@ -37,16 +37,6 @@ const LARGE: usize = 1 << 16;
 /// Rows of a band of [`Plane::box_sum`].
 const BAND: usize = 128;
 
-/// Calls `f` with each row of `data`, of `width` values, and its number.
-fn in_rows(data: &mut [f32], width: usize, f: impl Fn(usize, &mut [f32]) + Sync) {
-    let width = width.max(1);
-    if data.len() < LARGE {
-        data.chunks_exact_mut(width).enumerate().for_each(|(y, row)| f(y, row));
-    } else {
-        data.par_chunks_exact_mut(width).enumerate().for_each(|(y, row)| f(y, row));
-    }
-}
-
 /// One channel, `width * height` values, row-major, pixel centres at integers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plane {
@@ -66,8 +56,18 @@ impl Plane {
 
     /// A plane whose value at (x, y) is `f(x, y)`, which several threads ask for where it is large.
     pub fn from_fn(width: usize, height: usize, f: impl Fn(usize, usize) -> f32 + Sync) -> Self {
+        Self::from_rows(width, height, |y, row| row.iter_mut().enumerate().for_each(|(x, v)| *v = f(x, y)))
+    }
+
+    /// A plane whose rows `f` makes of rows of zeros, several threads at a time where it is large.
+    pub fn from_rows(width: usize, height: usize, f: impl Fn(usize, &mut [f32]) + Sync) -> Self {
         let mut data = vec![0.0; width * height];
-        in_rows(&mut data, width, |y, row| row.iter_mut().enumerate().for_each(|(x, v)| *v = f(x, y)));
+        let chunk = width.max(1);
+        if data.len() < LARGE {
+            data.chunks_exact_mut(chunk).enumerate().for_each(|(y, row)| f(y, row));
+        } else {
+            data.par_chunks_exact_mut(chunk).enumerate().for_each(|(y, row)| f(y, row));
+        }
         Self { width, height, data }
     }
 
@@ -94,6 +94,12 @@ impl Plane {
         self.data[y * self.width + x]
     }
 
+    /// The values of row `y`.
+    #[inline]
+    pub fn row(&self, y: usize) -> &[f32] {
+        &self.data[y * self.width..(y + 1) * self.width]
+    }
+
     /// Value at (x, y), the nearest pixel's outside the plane.
     #[inline]
     pub fn clamped(&self, x: isize, y: isize) -> f32 {
@@ -102,9 +108,7 @@ impl Plane {
 
     /// A new plane with `f` applied to each value.
     pub fn map(&self, f: impl Fn(f32) -> f32 + Sync) -> Self {
-        let mut data = self.data.clone();
-        in_rows(&mut data, self.width, |_, row| row.iter_mut().for_each(|v| *v = f(*v)));
-        Self { width: self.width, height: self.height, data }
+        Self::from_rows(self.width, self.height, |y, row| row.iter_mut().zip(self.row(y)).for_each(|(to, &v)| *to = f(v)))
     }
 
     /// A new plane with `f` applied to each pair of values.
@@ -113,9 +117,9 @@ impl Plane {
     /// When the sizes differ.
     pub fn zip(&self, other: &Self, f: impl Fn(f32, f32) -> f32 + Sync) -> Self {
         assert_eq!(self.size(), other.size(), "planes of one size");
-        let (w, mut data) = (self.width, self.data.clone());
-        in_rows(&mut data, w, |y, row| row.iter_mut().zip(&other.data[y * w..]).for_each(|(a, &b)| *a = f(*a, b)));
-        Self { width: w, height: self.height, data }
+        Self::from_rows(self.width, self.height, |y, row| {
+            row.iter_mut().zip(self.row(y)).zip(other.row(y)).for_each(|((to, &a), &b)| *to = f(a, b));
+        })
     }
 
     /// (width, height).
@@ -146,8 +150,8 @@ impl Plane {
     /// Sums over squares of side 2 r + 1, clipped at the edges.
     pub fn box_sum(&self, r: usize) -> Self {
         let (w, h) = self.size();
-        let mut rows = self.clone();
-        rows.data.par_chunks_exact_mut(w.max(1)).zip(self.data.par_chunks_exact(w.max(1))).for_each(|(out, row)| {
+        let rows = Self::from_rows(w, h, |y, out| {
+            let row = self.row(y);
             let mut sum: f32 = row[..r.min(w)].iter().sum();
             for x in 0..w {
                 if x + r < w {
@@ -163,18 +167,17 @@ impl Plane {
         // Bands of rows that do not depend on the number of threads, and sums with them.
         out.data.par_chunks_mut(BAND * w.max(1)).enumerate().for_each(|(n, out)| {
             let first = n * BAND;
-            let row = |y: usize| &rows.data[y * w..(y + 1) * w];
             let mut sum = vec![0.0f32; w];
             for y in first.saturating_sub(r)..(first + r).min(h) {
-                sum.iter_mut().zip(row(y)).for_each(|(s, v)| *s += v);
+                sum.iter_mut().zip(rows.row(y)).for_each(|(s, v)| *s += v);
             }
             for (y, out) in (first..).zip(out.chunks_exact_mut(w.max(1))) {
                 if y + r < h {
-                    sum.iter_mut().zip(row(y + r)).for_each(|(s, v)| *s += v);
+                    sum.iter_mut().zip(rows.row(y + r)).for_each(|(s, v)| *s += v);
                 }
                 out.copy_from_slice(&sum);
                 if y >= r {
-                    sum.iter_mut().zip(row(y - r)).for_each(|(s, v)| *s -= v);
+                    sum.iter_mut().zip(rows.row(y - r)).for_each(|(s, v)| *s -= v);
                 }
             }
         });
@@ -227,8 +230,16 @@ impl Rgb {
 
     /// Mean of the given channels.
     pub fn mean_of(&self, channels: Channels) -> Plane {
-        let n = channels.count() as f32;
-        Plane::from_fn(self.width(), self.height(), |x, y| channels.indices().map(|c| self.0[c].at(x, y)).sum::<f32>() / n)
+        self.weighted(channels, [1.0; 3]).map(|v| v / channels.count() as f32)
+    }
+
+    /// Sum of the given channels, each times its weight.
+    pub fn weighted(&self, channels: Channels, weights: [f32; 3]) -> Plane {
+        Plane::from_rows(self.width(), self.height(), |y, row| {
+            for c in channels.indices() {
+                row.iter_mut().zip(self.0[c].row(y)).for_each(|(to, v)| *to += weights[c] * v);
+            }
+        })
     }
 
     /// Interleaved `[r, g, b]` of pixel `i` (row-major).

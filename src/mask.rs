@@ -25,10 +25,8 @@ const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
 /// Grey equivalent of `channels` of a frame's intensity: for all three, Rec. 601 luma.
 fn grey(frame: &Frame, channels: Channels) -> Plane {
-    let planes = &frame.intensity.0;
     let all: f32 = channels.indices().map(|c| LUMA[c]).sum();
-    let one = |x, y| channels.indices().map(|c| LUMA[c] / all * planes[c].at(x, y)).sum();
-    Plane::from_fn(planes[0].width, planes[0].height, one)
+    frame.intensity.weighted(channels, LUMA.map(|l| l / all))
 }
 
 /// Where any of `channels` of the frame is clipped.

@@ -97,19 +97,34 @@ pub fn misfit(irradiance: &Rgb, exposure: &Rgb, mask: &Plane, curves: &[Vec<f32>
 }
 
 /// Mean over squares of side 2 r + 1, edge pixels repeated.
-fn box_mean(plane: &Plane, r: isize) -> Plane {
+fn box_mean(plane: &Plane, r: usize) -> Plane {
     let n = (2 * r + 1) as f32;
     let (w, h) = plane.size();
-    let rows = Plane::from_fn(w, h, |x, y| (-r..=r).map(|k| plane.clamped(x as isize + k, y as isize)).sum::<f32>() / n);
-    Plane::from_fn(w, h, |x, y| (-r..=r).map(|k| rows.clamped(x as isize, y as isize + k)).sum::<f32>() / n)
+    let rows = Plane::from_rows(w, h, |y, out| {
+        let row = plane.row(y);
+        let padded = [vec![row[0]; r], row.to_vec(), vec![row[w - 1]; r]].concat();
+        for k in 0..=2 * r {
+            out.iter_mut().zip(&padded[k..]).for_each(|(o, v)| *o += v);
+        }
+        out.iter_mut().for_each(|o| *o /= n);
+    });
+    Plane::from_rows(w, h, |y, out| {
+        for k in 0..=2 * r {
+            out.iter_mut().zip(rows.row((y + k).saturating_sub(r).min(h - 1))).for_each(|(o, v)| *o += v);
+        }
+        out.iter_mut().for_each(|o| *o /= n);
+    })
 }
 
 /// Mean absolute gradient of `plane` around each pixel, over squares of side 2 r + 1.
-pub fn gradient_level(plane: &Plane, r: isize) -> Plane {
+pub fn gradient_level(plane: &Plane, r: usize) -> Plane {
     let (w, h) = plane.size();
-    let gradient = Plane::from_fn(w, h, |x, y| {
-        let (i, j) = (x as isize, y as isize);
-        (plane.clamped(i + 1, j) - plane.clamped(i, j)).hypot(plane.clamped(i, j + 1) - plane.clamped(i, j))
+    let gradient = Plane::from_rows(w, h, |y, out| {
+        let (row, below) = (plane.row(y), plane.row((y + 1).min(h - 1)));
+        for x in 0..w {
+            let (dx, dy) = (row[(x + 1).min(w - 1)] - row[x], below[x] - row[x]);
+            out[x] = (dx * dx + dy * dy).sqrt();
+        }
     });
     box_mean(&gradient, r)
 }

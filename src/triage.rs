@@ -201,10 +201,10 @@ impl Luminance {
             })
             .collect();
         let plane = |from: &Plane| {
-            let data = sources.iter().map(|q| q.map_or(0.0, |q| from.data[q])).collect();
+            let data = sources.par_iter().map(|q| q.map_or(0.0, |q| from.data[q])).collect();
             Plane { width, height, data }
         };
-        let valid = sources.iter().map(|q| q.is_some_and(|q| self.valid[q])).collect();
+        let valid = sources.par_iter().map(|q| q.is_some_and(|q| self.valid[q])).collect();
         Self { value: plane(&self.value), variance: plane(&self.variance), valid, ..*self }
     }
 
