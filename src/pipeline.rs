@@ -17,6 +17,7 @@ use crate::response::Response;
 use crate::triage::{self, Verdict};
 use crate::tsf::{self, Model, Search, Tsf, TsfEntry, TsfFile, WholeFrame};
 use glam::{DMat3, DVec2};
+use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -1161,14 +1162,15 @@ impl Run<'_> {
         } else {
             self.settings.patches.iter().map(|&(x, y)| psf::around(seen, weight, x, y, size)).collect()
         };
+        let wanted = self.settings.psf_radius;
         let measure = |p: &psf::Patch| {
             let path = tsf::path_at(tsf, p.centre(), (w, h));
             let reach = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
-            let radius = self.settings.psf_radius.map_or(reach, |r| r as isize);
+            let radius = wanted.map_or(reach, |r| r as isize);
             let near = |x: isize, y: isize| path.iter().any(|u| (u.0 - x).abs() <= PSF_MARGIN && (u.1 - y).abs() <= PSF_MARGIN);
             Some((*p, psf::estimate_within(seen, 0, blurred, weight, p, radius as usize, &near)?))
         };
-        patches.iter().filter_map(measure).collect()
+        patches.par_iter().filter_map(measure).collect()
     }
 
     /// The irradiance `latent` on the grid of a frame at `motion`, and 1 where it reaches.
