@@ -1,7 +1,7 @@
-//! Pictures of an estimated TSF beside the truth, for docs/: `cargo run --release --example tsf_pictures -- docs`.
+//! Pictures of an estimated TSF beside the truth, for docs/: `cargo run --release --example tsf_pictures -- docs/pictures`.
 //!
-//! Reconstructs the demo's bracket and draws, for its longest frame, the local PSFs (`tsf-psfs.png`), the TSF in three projections
-//! (`tsf-projections.png`) and the camera's path over the frame (`tsf-path.png`).
+//! Reconstructs the demo's bracket and draws, for its longest frame, the local PSFs (`tsf-psfs.jpg`), the TSF in three projections
+//! (`tsf-projections.jpg`) and the camera's path over the frame (`tsf-path.jpg`).
 
 use glam::DVec2;
 use image::{Rgb, RgbImage};
@@ -28,10 +28,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let found = Tsf::new(entry.focal_px, entry.poses)?;
     println!("model {}, {} poses", report["blur"]["model"], found.poses.len());
     let size = made.bracket.size();
-    psfs(&report["blur"]["patches"], &made.tsfs[last], &found, size).save(folder.join("tsf-psfs.png"))?;
-    projections(&made.tsfs[last], &found).save(folder.join("tsf-projections.png"))?;
+    psfs(&report["blur"]["patches"], &made.tsfs[last], &found, size).save(folder.join("tsf-psfs.jpg"))?;
+    projections(&made.tsfs[last], &found).save(folder.join("tsf-projections.jpg"))?;
     let tone_mapped = tonemap::preview(&made.truth);
-    path(tone_mapped, &made.tsfs[last], &found, size).save(folder.join("tsf-path.png"))?;
+    path(tone_mapped, &made.tsfs[last], &found, size).save(folder.join("tsf-path.jpg"))?;
     Ok(())
 }
 
@@ -129,32 +129,36 @@ fn psfs(patches: &serde_json::Value, truth: &Tsf, found: &Tsf, size: (usize, usi
     image
 }
 
+/// Three projections of both TSFs, one over the other.
 fn projections(truth: &Tsf, found: &Tsf) -> RgbImage {
     let (side, gap) = (260.0, 40.0);
-    let mut image = RgbImage::from_pixel((3.0 * (side + gap) + gap) as u32, (2.0 * (side + gap) + gap) as u32, Rgb([40, 40, 40]));
+    let mut image = RgbImage::from_pixel((3.0 * (side + gap) + gap) as u32, (side + 2.0 * gap) as u32, Rgb([40, 40, 40]));
     let axes: [fn(&unshaken::pose::Pose) -> f64; 3] = [|p| p.t_x, |p| p.t_y, |p| p.theta_z_deg];
-    let names = ["TX, PX", "TY, PX", "ROLL, DEG"];
+    let names = ["TX", "TY", "ROLL"];
     let range = |f: fn(&unshaken::pose::Pose) -> f64| {
         let all = truth.poses.iter().chain(&found.poses).map(f);
         let (a, b) = all.fold((f64::MAX, f64::MIN), |(a, b), v| (a.min(v), b.max(v)));
         (a - 0.1 * (b - a), b + 0.1 * (b - a))
     };
-    for (row, (name, tsf, colour)) in [("TRUE", truth, TRUE), ("FOUND", found, FOUND)].into_iter().enumerate() {
-        for (column, (i, j)) in [(0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
-            let o = DVec2::new(gap + column as f64 * (side + gap), gap + row as f64 * (side + gap));
-            for (a, b) in [(DVec2::ZERO, DVec2::X), (DVec2::X, DVec2::ONE), (DVec2::ONE, DVec2::Y), (DVec2::Y, DVec2::ZERO)] {
-                line(&mut image, o + a * side, o + b * side, 1.0, [110; 3], 1.0);
-            }
-            let (x, y) = (range(axes[i]), range(axes[j]));
-            let top = tsf.poses.iter().map(|p| p.weight).fold(0.0, f64::max);
-            for p in &tsf.poses {
-                let at = DVec2::new((axes[i](p) - x.0) / (x.1 - x.0), (axes[j](p) - y.0) / (y.1 - y.0)) * side + o;
-                line(&mut image, at, at, 2.0 + 5.0 * (p.weight / top).sqrt(), colour, 0.8);
-            }
-            let title = format!("{name}: {} {:.1}..{:.1}  {} {:.1}..{:.1}", names[i], x.0, x.1, names[j], y.0, y.1);
-            write(&mut image, &title.replace("..", " - "), o.x as f32, (o.y - 17.0) as f32, [210; 3]);
+    for (column, (i, j)) in [(0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
+        let o = DVec2::new(gap + column as f64 * (side + gap), gap);
+        for (a, b) in [(DVec2::ZERO, DVec2::X), (DVec2::X, DVec2::ONE), (DVec2::ONE, DVec2::Y), (DVec2::Y, DVec2::ZERO)] {
+            line(&mut image, o + a * side, o + b * side, 1.0, [110; 3], 1.0);
         }
+        let (x, y) = (range(axes[i]), range(axes[j]));
+        let at = |p: &unshaken::pose::Pose| DVec2::new((axes[i](p) - x.0) / (x.1 - x.0), (axes[j](p) - y.0) / (y.1 - y.0)) * side + o;
+        for pair in truth.poses.windows(2) {
+            line(&mut image, at(&pair[0]), at(&pair[1]), 1.5, TRUE, 0.6);
+        }
+        let top = found.poses.iter().map(|p| p.weight).fold(0.0, f64::max);
+        for p in &found.poses {
+            line(&mut image, at(p), at(p), 3.0 + 6.0 * (p.weight / top).sqrt(), FOUND, 0.9);
+        }
+        write(&mut image, &format!("{} {:.1} TO {:.1}", names[i], x.0, x.1), o.x as f32, (o.y + side + 8.0) as f32, [210; 3]);
+        write(&mut image, &format!("{} {:.1} TO {:.1}", names[j], y.0, y.1), o.x as f32, (o.y - 17.0) as f32, [210; 3]);
     }
+    write(&mut image, "TRUE", (gap + 165.0) as f32, 23.0, TRUE);
+    write(&mut image, "FOUND", (gap + 215.0) as f32, 23.0, FOUND);
     image
 }
 

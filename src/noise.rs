@@ -214,11 +214,11 @@ fn clear(intensity: &Plane, i: usize, j: usize) -> bool {
 }
 
 /// High-pass variance of the blocks that no clipping touches, of [`ENOUGH`] that are spread over the frame where it has more.
-fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) -> Vec<Sample> {
+fn collect_blocks(source: &Source, lag: usize, quantum: &(impl Fn(f64) -> f64 + Sync)) -> Vec<Sample> {
     let (w, h) = source.exposure.size();
-    let mut blocks = Vec::new();
     let step = BLOCK * (w * h / (BLOCK * BLOCK)).div_ceil(ENOUGH).isqrt().max(1);
-    for by in (lag..h.saturating_sub(BLOCK + lag - 1)).step_by(step) {
+    let row = |by: usize| {
+        let mut blocks = Vec::new();
         for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(step) {
             let mut around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
             let usable = |(i, j): (usize, usize)| clear(source.intensity, i, j) && source.less.is_none_or(|l| clear(l.0, i, j));
@@ -244,8 +244,10 @@ fn collect_blocks(source: &Source, lag: usize, quantum: &impl Fn(f64) -> f64) ->
             let ratio = source.less.map_or(0.0, |l| l.2);
             blocks.push(Sample::new(exposure, ratio, (square - rounding(quantum, exposure, ratio)).max(0.0)));
         }
-    }
-    blocks
+        blocks
+    };
+    let rows = h.saturating_sub(BLOCK + 2 * lag - 1).div_ceil(step);
+    (0..rows).into_par_iter().flat_map_iter(|n| row(lag + n * step)).collect()
 }
 
 /// Part of the flattest blocks' samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.

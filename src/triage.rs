@@ -352,11 +352,12 @@ fn unreached(frames: &[usize], begin: Option<usize>, is_like: impl Fn(usize, usi
 
 /// [`Verdict::steepness`] and [`Verdict::evenness`].
 fn steepness(a: &Luminance) -> (f64, f64) {
-    let steep = DIRECTIONS.map(|d| {
+    let along = |&d: &(usize, usize, bool)| {
         let (one, two) = (energy(a, a, &a.valid, d, 1), energy(a, a, &a.valid, d, 2));
         (two.sum > 3.0 * two.error).then(|| one.sum.max(0.0) / two.sum)
-    });
-    let least = steep.into_iter().flatten().reduce(f64::min);
+    };
+    let steep: Vec<Option<f64>> = DIRECTIONS.par_iter().map(along).collect();
+    let least = steep.iter().flatten().copied().reduce(f64::min);
     // The axes, and the diagonals: a pixel across is not a diagonal of one.
     let even = steep.chunks(2).filter_map(|pair| match *pair {
         [Some(a), Some(b)] if a.max(b) > 0.0 => Some(a.min(b) / a.max(b)),
