@@ -194,8 +194,8 @@ impl Pass<'_> {
                     channel[k] += given * power[k];
                 }
             }
-            for k in 0..VALUES {
-                channel[k] = self.strength * self.strength / channel[k].max(1.0 / (UNKNOWN * UNKNOWN));
+            for value in channel {
+                *value = self.strength * self.strength / value.max(1.0 / (UNKNOWN * UNKNOWN));
             }
         }
         let mut mixed = [[0f32; VALUES]; 3];
@@ -294,12 +294,12 @@ impl Pass<'_> {
                 let stack = &mut stack[..places.len()];
                 let known = &mut known[..if self.basic.is_some() { places.len() } else { 0 }];
                 let variances = self.variances((x, y));
-                for c in 0..3 {
+                for (c, variance) in variances.iter().enumerate() {
                     self.transformed(&self.noisy.0[c], &places, stack, &mut spare);
                     if let Some(basic) = self.basic {
                         self.transformed(&basic.0[c], &places, known, &mut spare);
                     }
-                    let weight = 1.0 / Self::shrink(stack, known, &variances[c]).max(f32::MIN_POSITIVE);
+                    let weight = 1.0 / Self::shrink(stack, known, variance).max(f32::MIN_POSITIVE);
                     haar(stack, &mut spare, true);
                     for (&(_, (x, y)), coefficients) in places.iter().zip(stack.iter()) {
                         let p = product(&product(&self.inverse, coefficients), &self.dct);
