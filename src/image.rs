@@ -34,8 +34,8 @@ impl Channels {
 
 /// Values from which several threads share the work.
 const LARGE: usize = 1 << 16;
-/// Rows of a band of [`Plane::box_sum`].
-const BAND: usize = 128;
+/// Columns of a strip of [`Plane::box_sum`].
+const STRIP: usize = 64;
 
 /// One channel, `width * height` values, row-major, pixel centres at integers.
 #[derive(Clone, Debug, PartialEq)]
@@ -163,25 +163,32 @@ impl Plane {
                 }
             }
         });
-        let mut out = rows.clone();
-        // Bands of rows that do not depend on the number of threads, and sums with them.
-        out.data.par_chunks_mut(BAND * w.max(1)).enumerate().for_each(|(n, out)| {
-            let first = n * BAND;
-            let mut sum = vec![0.0f32; w];
-            for y in first.saturating_sub(r)..(first + r).min(h) {
-                sum.iter_mut().zip(rows.row(y)).for_each(|(s, v)| *s += v);
+        // Strips of columns, each from the top down: a sum of its own in every column, whatever the number of threads.
+        let strip = |n: usize| {
+            let columns = n * STRIP..((n + 1) * STRIP).min(w);
+            let mut out = Vec::with_capacity(h * columns.len());
+            let mut sum = [0.0f32; STRIP];
+            let row = |y: usize| &rows.row(y)[columns.clone()];
+            for y in 0..r.min(h) {
+                sum.iter_mut().zip(row(y)).for_each(|(s, v)| *s += v);
             }
-            for (y, out) in (first..).zip(out.chunks_exact_mut(w.max(1))) {
+            for y in 0..h {
                 if y + r < h {
-                    sum.iter_mut().zip(rows.row(y + r)).for_each(|(s, v)| *s += v);
+                    sum.iter_mut().zip(row(y + r)).for_each(|(s, v)| *s += v);
                 }
-                out.copy_from_slice(&sum);
+                out.extend_from_slice(&sum[..columns.len()]);
                 if y >= r {
-                    sum.iter_mut().zip(rows.row(y - r)).for_each(|(s, v)| *s -= v);
+                    sum.iter_mut().zip(row(y - r)).for_each(|(s, v)| *s -= v);
                 }
             }
-        });
-        out
+            out
+        };
+        let strips: Vec<Vec<f32>> = (0..w.div_ceil(STRIP)).into_par_iter().map(strip).collect();
+        Self::from_rows(w, h, |y, out| {
+            for (to, from) in out.chunks_mut(STRIP).zip(&strips) {
+                to.copy_from_slice(&from[y * to.len()..(y + 1) * to.len()]);
+            }
+        })
     }
 
     /// The plane with `pad` more pixels on every side, each a copy of the nearest edge pixel.

@@ -122,8 +122,7 @@ pub fn gradient_level(plane: &Plane, r: usize) -> Plane {
     let gradient = Plane::from_rows(w, h, |y, out| {
         let (row, below) = (plane.row(y), plane.row((y + 1).min(h - 1)));
         for x in 0..w {
-            let (dx, dy) = (row[(x + 1).min(w - 1)] - row[x], below[x] - row[x]);
-            out[x] = (dx * dx + dy * dy).sqrt();
+            out[x] = (row[(x + 1).min(w - 1)] - row[x]).hypot(below[x] - row[x]);
         }
     });
     box_mean(&gradient, r)
