@@ -225,9 +225,10 @@ const ONE_SET_FREE: Shown = Shown { left: 0.73, unlike: 0.25 };
 /// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
 const SEVERAL_SET_FREE: Shown = Shown { left: 0.9, unlike: 0.12 };
-/// [`blind::Freed::held_out`] at most: what the frames do not agree about beyond is no motion. Aliasing leaves up to 9 at a full well of 4000 electrons, and as
-/// much more as there is less noise.
+/// [`blind::Freed::held_out`] at most, whatever the noise: what the frames do not agree about beyond is no motion.
 const AGREED: f64 = 300.0;
+/// The same times the variance of shot noise at white: aliasing leaves up to 9 at a full well of 4000 electrons, and as much more as there is less noise.
+const AGREED_BY_NOISE: f64 = 30.0 / 4000.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
@@ -745,7 +746,8 @@ impl Run<'_> {
         let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
         let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
         let moved = longest > SHAKEN && longest < TOO_FAR;
-        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < AGREED;
+        let agreed = AGREED.min(AGREED_BY_NOISE / self.noise.shot);
+        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed;
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
