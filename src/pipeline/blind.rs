@@ -285,6 +285,11 @@ pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
     used.iter().map(|&i| &verdicts[i]).any(|v| v.sharp && v.compared && v.detail < LESS_DETAILED)
 }
 
+/// What may be left of frames that agree about a motion, in units of the noise, whose shot noise has the variance `shot` at white.
+fn agreed(shot: f64) -> f64 {
+    AGREED.min(AGREED_BY_NOISE / shot)
+}
+
 /// Those of the frames `passing` that are asked about as they are, after a look by which residuals grow by `growth` if all of `alike` are held: none
 /// where that is clear, unless others were held with them, whose motion says nothing of theirs.
 fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] {
@@ -746,8 +751,7 @@ impl Run<'_> {
         let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
         let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
         let moved = longest > SHAKEN && longest < TOO_FAR;
-        let agreed = AGREED.min(AGREED_BY_NOISE / self.noise.shot);
-        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed;
+        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
@@ -837,6 +841,14 @@ mod tests {
         assert!(!less_detailed(&all, &[0, 3]), "the other one does not pass for sharp");
         assert!(!less_detailed(&all, &[0]), "the other one is not in use");
         assert!(!less_detailed(&all, &[0, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn what_aliasing_leaves_is_allowed_by_the_noise() {
+        assert!(agreed(1.0 / 4000.0) > 9.0, "aliasing at a full well of 4000 electrons");
+        assert!(agreed(1.0 / 17_500.0) < 295.0, "flare and a fountain, photographed at night");
+        assert!((agreed(1.0 / 8000.0) / agreed(1.0 / 4000.0) - 2.0).abs() < 1e-9, "half the variance, twice as much");
+        assert!((agreed(1e-9) - 300.0).abs() < 1e-9, "whatever the noise");
     }
 
     #[test]
