@@ -231,8 +231,7 @@ impl Rgb {
 
     /// Mean of the three channels.
     pub fn mean(&self) -> Plane {
-        let [r, g, b] = &self.0;
-        Plane::from_fn(self.width(), self.height(), |x, y| (r.at(x, y) + g.at(x, y) + b.at(x, y)) / 3.0)
+        self.mean_of(Channels::ALL)
     }
 
     /// Mean of the given channels.

@@ -403,9 +403,7 @@ impl Gpu {
             let size = piece.len() as u64;
             if self.uploading.fetch_add(size, Ordering::Relaxed) + size > UPLOADS {
                 self.uploading.store(size, Ordering::Relaxed);
-                let index = self.pass(None);
-                // A device that does not answer is noticed, and told, where results are read.
-                let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
+                self.wait(self.pass(None));
             }
             self.queue.write_buffer(buffer, n as u64 * UPLOADS, piece);
         }
@@ -451,13 +449,17 @@ impl Gpu {
         self.queue.submit(commands)
     }
 
+    /// Waits for a submission. A device that does not answer is noticed, and told, where results are read.
+    fn wait(&self, index: wgpu::SubmissionIndex) {
+        let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
+    }
+
     /// Waits for the turn before the one that was just submitted, and makes the next as long as a turn should be.
     fn next_turn(&self, turns: &Turns, steps: usize, index: wgpu::SubmissionIndex) {
         let mut last = turns.last.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let before = last.replace((index, Instant::now(), steps));
         let Some((index, start, steps)) = before else { return };
-        // A device that does not answer is noticed, and told, where results are read.
-        let _ = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: Some(readback::TIMEOUT) });
+        self.wait(index);
         let took = start.elapsed();
         let fits = (steps as f64 * TURN.as_secs_f64() / took.as_secs_f64().max(1e-6)) as usize;
         let (now, fewest) = (turns.steps.load(Ordering::Relaxed), if took > LONG { 1 } else { FEWEST });
