@@ -6,12 +6,14 @@
 //! and averaged where they overlap; first by a threshold, then by the Wiener filter that the first result suggests. Detail that repeats, or
 //! that stands out of its noise, stays; total variation, which only knows that edges are few, cannot tell fine texture from noise.
 //!
-//! The variance of a coefficient is `1 / (p + Σ_i p_i P_i)`: p is the inverse variance that sharp frames give, p_i what shaken frame i gives
-//! where its blur passes all ([`Precision`]), P_i its blur's power at the coefficient's frequency. Channels are filtered in an orthonormal
+//! The variance of a coefficient is `1 / (p + Σ_i p_i P_i)`: p is the inverse variance that sharp frames in place give, p_i what frame i, shaken or
+//! displaced, gives where its blur or interpolation passes all ([`Precision`]), P_i the power of that at the coefficient's frequency. Channels are filtered in an orthonormal
 //! opponent space, in stacks that the sum of the channels chooses.
 
 use crate::image::{Plane, Rgb};
+use crate::pose::project;
 use crate::sampling::wide;
+use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
 /// Side of a patch in pixels.
@@ -40,8 +42,56 @@ const EACH: usize = 2;
 pub struct Precision {
     /// What frames give that no blur affects.
     pub white: Rgb,
-    /// For each shaken frame, what it gives at frequency 0, and the power of its PSF at the frequencies of the patch transform.
-    pub shaken: Vec<(Rgb, Patch)>,
+    /// For each frame that is shaken or displaced, what it gives at frequency 0, and its power at the others.
+    pub blurred: Vec<(Rgb, Power)>,
+}
+
+/// Power of what a frame makes of the scene at the frequencies of the patch transform.
+#[derive(Clone)]
+pub enum Power {
+    /// Of a PSF, the same everywhere.
+    Same(Patch),
+    /// Of an interpolation, by where the frame's pixels fall.
+    Between(Between),
+}
+
+/// Power of the interpolation between the pixels by which a displaced frame is predicted.
+#[derive(Clone)]
+pub struct Between {
+    /// From (x, y) on the grid of the values to the frame's pixels.
+    pub motion: DMat3,
+    /// Along one axis, at displacements by fractions of a pixel in equal steps from 0 to below 1.
+    pub axis: Vec<[f32; SIDE]>,
+}
+
+impl Between {
+    /// By the displacement of the middle of the patch whose first pixel is (x, y).
+    fn at(&self, (x, y): (usize, usize)) -> Patch {
+        let middle = DVec2::new(x as f64, y as f64) + 0.5 * (SIDE - 1) as f64;
+        let displacement = project(&self.motion, middle) - middle;
+        let n = self.axis.len();
+        let along = |d: f64| &self.axis[(d.rem_euclid(1.0) * n as f64).round() as usize % n];
+        let (across, down) = (along(displacement.x), along(displacement.y));
+        std::array::from_fn(|k| across[k % SIDE] * down[k / SIDE])
+    }
+}
+
+impl Power {
+    /// Of the patch whose first pixel is `at`.
+    fn at(&self, at: (usize, usize)) -> Patch {
+        match self {
+            Self::Same(power) => *power,
+            Self::Between(between) => between.at(at),
+        }
+    }
+
+    /// Mean over the frequencies, and over a frame where it differs.
+    pub fn mean(&self) -> f32 {
+        match self {
+            Self::Same(power) => power.iter().sum::<f32>() / VALUES as f32,
+            Self::Between(Between { axis, .. }) => (axis.iter().flatten().sum::<f32>() / (axis.len() * SIDE) as f32).powi(2),
+        }
+    }
 }
 
 /// Orthonormal DCT-II of one dimension: row k is frequency k.
@@ -185,10 +235,11 @@ impl Pass<'_> {
     /// Variances of the coefficients of the patch at `at`, by opponent channel.
     #[inline(always)]
     fn variances(&self, at: (usize, usize)) -> [Patch; 3] {
+        let powers: Vec<Patch> = self.precision.blurred.iter().map(|(_, power)| power.at(at)).collect();
         let mut channels = [[0f32; VALUES]; 3];
         for (c, channel) in channels.iter_mut().enumerate() {
             *channel = [Self::mean(&self.precision.white.0[c], at); VALUES];
-            for (given, power) in &self.precision.shaken {
+            for ((given, _), power) in self.precision.blurred.iter().zip(&powers) {
                 let given = Self::mean(&given.0[c], at);
                 for k in 0..VALUES {
                     channel[k] += given * power[k];
@@ -350,8 +401,8 @@ pub fn filtered(image: &Rgb, precision: &Precision, strength: f32, progress: &mu
         // Smaller than a patch: with its last pixels repeated.
         let (w, h) = (width.max(SIDE), height.max(SIDE));
         let larger = |i: &Rgb| i.map_planes(|p| Plane::from_fn(w, h, |x, y| p.clamped(x as isize, y as isize)));
-        let shaken = precision.shaken.iter().map(|(p, power)| (larger(p), *power)).collect();
-        let precision = Precision { white: larger(&precision.white), shaken };
+        let blurred = precision.blurred.iter().map(|(p, power)| (larger(p), power.clone())).collect();
+        let precision = Precision { white: larger(&precision.white), blurred };
         return filtered(&larger(image), &precision, strength, progress).map(|f| f.map_planes(|p| p.crop(0, 0, width, height)));
     }
     let (dct, opponent) = (dct(), opponent());

@@ -36,6 +36,7 @@ use crate::kernels::{
     STILL, Scratch, ScratchSize, WeightTarget, channels, partials_1d, partials_2d,
 };
 use crate::tsf::{Interpolation, TapSet, Tsf};
+use glam::DMat3;
 use memory::{Need, Plan};
 use serde::Serialize;
 use std::ops::Range;
@@ -210,7 +211,8 @@ struct Operator {
     /// About the same for less, in the matrix of a step; `None` where nothing costs less.
     rough: Option<Blur>,
     interpolation: Interpolation,
-    still: bool,
+    /// Where a frame of one pose lies, centred pixels.
+    still: Option<DMat3>,
     energy: f32,
     /// (x, y, weight) near the frame's centre.
     psf: Vec<(f64, f64, f64)>,
@@ -344,8 +346,8 @@ impl Layout {
         let frame = (latent.0 - 2 * pad, latent.1 - 2 * pad);
         let (n, m) = (latent.0 * latent.1, frame.0 * frame.1);
         let operator = |tsf: &Tsf| {
-            let still = tsf.single().is_some();
-            let interpolation = if still { STILL } else { interpolation };
+            let still = tsf.single();
+            let interpolation = if still.is_some() { STILL } else { interpolation };
             let taps = TapSet::new(tsf, frame.0, frame.1, interpolation);
             let about = |taps: &TapSet| Blur::new(gpu, kernels.blur(interpolation), taps, frame, pad);
             let blur = about(&taps);
@@ -613,7 +615,7 @@ impl<'a> Solver<'a> {
         for (i, observed) in self.observed.iter().enumerate() {
             let robust = match &observed.moving {
                 None => 0.0,
-                Some(moving) if moving.operator.still => STILL_ROBUST * robust,
+                Some(moving) if moving.operator.still.is_some() => STILL_ROBUST * robust,
                 Some(_) => robust,
             };
             if robust > 0.0 {
@@ -687,11 +689,11 @@ impl<'a> Solver<'a> {
         steps
     }
 
-    /// Steps of the diagonal of Σ Kᵀ W K of some channels, roughly, over the frames in place and those that `counts` holds for; into `product`.
-    fn diagonal(&self, group: &Range<usize>, counts: fn(&Moving) -> bool) -> Vec<Step> {
+    /// Steps of the diagonal of Σ Kᵀ W K of some channels, roughly; into `product`.
+    fn diagonal(&self, group: &Range<usize>) -> Vec<Step> {
         let s = &self.state;
         let mut steps: Vec<Step> = group.clone().zip(&s.product).map(|(c, to)| Step::Copy(s.weight[c].clone(), to.clone())).collect();
-        for moving in self.moving().filter(|m| counts(m)) {
+        for moving in self.moving() {
             steps.extend(moving.adjoint(self, &moving.weight[group.clone()], &s.product, moving.operator.energy));
         }
         steps
@@ -702,7 +704,7 @@ impl<'a> Solver<'a> {
         let (s, linear) = (&self.state, &self.kernels.linear);
         let n = self.counts().0;
         let partials = partials_1d(self.gpu, n);
-        let mut steps = self.diagonal(group, |_| true);
+        let mut steps = self.diagonal(group);
         for (k, c) in group.clone().enumerate() {
             let (r, d) = (&s.residual[k], &s.diagonal[k]);
             steps.extend(linear.right_side(self.gpu, &s.irradiance[c], &s.back[k], &s.edge, &s.product[k], r, d, self.latent));
@@ -839,7 +841,7 @@ impl<'a> Solver<'a> {
     /// Whether all frames are sharp, and what they leave unexplained at the start, under the weights `trusting`, is far more than their noise and their pixels
     /// make; `evaluate`: steps of the objective.
     fn sharp_frames_disagree(&self, trusting: &[Step], evaluate: &[Step]) -> Result<bool> {
-        if self.moving().count() == 0 || self.moving().any(|m| !m.operator.still) {
+        if self.moving().count() == 0 || self.moving().any(|m| m.operator.still.is_none()) {
             return Ok(false);
         }
         self.gpu.submit(trusting);

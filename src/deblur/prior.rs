@@ -1,11 +1,13 @@
 //! The prior: total variation inside the iteration, collaborative filtering behind it.
 
 use super::Solver;
-use crate::collaborative::{self, Patch, Precision, SIDE, VALUES};
+use crate::collaborative::{self, Between, Patch, Power, Precision, SIDE, VALUES};
 use crate::error::{Error, Result};
 use crate::gpu::{self, Step};
 use crate::image::{Plane, Rgb};
 use crate::kernels::DeviceRgb;
+use crate::tsf::Interpolation;
+use glam::{DMat3, DVec2};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::Arc;
@@ -37,6 +39,9 @@ impl Prior {
     }
 }
 
+/// Where around a frequency of the patch transform power is looked at.
+const AROUND: [f64; 2] = [-0.25, 0.25];
+
 /// Power of a PSF (x, y, weight) around the frequencies of the patch transform, over both signs of the vertical one, which that does not
 /// tell apart.
 fn power(psf: &[(f64, f64, f64)]) -> Patch {
@@ -47,12 +52,28 @@ fn power(psf: &[(f64, f64, f64)]) -> Patch {
         });
         re * re + im * im
     };
-    const AROUND: [(f64, f64); 4] = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
     std::array::from_fn::<f32, VALUES, _>(|k| {
         let (u, v) = ((k % SIDE) as f64, (k / SIDE) as f64);
-        let sum: f64 = AROUND.iter().flat_map(|(a, b)| [1.0, -1.0].map(|s| at((u + a) / SIDE as f64, s * (v + b) / SIDE as f64))).sum();
-        (sum / (2 * AROUND.len()) as f64) as f32
+        let around = AROUND.iter().flat_map(|a| AROUND.map(|b| (u + a, v + b)));
+        let sum: f64 = around.flat_map(|(u, v)| [1.0, -1.0].map(|s| at(u / SIDE as f64, s * v / SIDE as f64))).sum();
+        (sum / (2 * AROUND.len() * AROUND.len()) as f64) as f32
     })
+}
+
+/// Fractions of a pixel that are told apart.
+const FRACTIONS: usize = 16;
+
+/// Power along one axis of reading `fraction` of a pixel beside the pixels, around the frequencies of the patch transform.
+fn axis_power(kind: Interpolation, fraction: f64) -> [f32; SIDE] {
+    let support = kind.support() as isize;
+    let at = |f: f64| {
+        let (re, im) = (1 - support..=support).fold((0.0, 0.0), |(re, im), k| {
+            let (weight, (sin, cos)) = (kind.weight(k as f64 - fraction), (std::f64::consts::PI * f * k as f64).sin_cos());
+            (re + weight * cos, im + weight * sin)
+        });
+        re * re + im * im
+    };
+    std::array::from_fn(|u| (AROUND.iter().map(|a| at((u as f64 + a) / SIDE as f64)).sum::<f64>() / AROUND.len() as f64) as f32)
 }
 
 /// What the filter adds to irradiance before the logarithm, in standard deviations of the darkest pixels' irradiance: below it values are
@@ -65,8 +86,8 @@ fn offset(weights: &Precision) -> f32 {
     let mut sample = Vec::new();
     for c in 0..3 {
         sample.extend((0..n).step_by(n.div_ceil(100_000)).map(|i| {
-            let through = |(given, power): &(Rgb, Patch)| given.0[c].data[i] * power.iter().sum::<f32>() / VALUES as f32;
-            weights.white.0[c].data[i] + weights.shaken.iter().map(through).sum::<f32>()
+            let through = |(given, power): &(Rgb, Power)| given.0[c].data[i] * power.mean();
+            weights.white.0[c].data[i] + weights.blurred.iter().map(through).sum::<f32>()
         }));
     }
     sample.retain(|w| *w > 0.0);
@@ -90,17 +111,28 @@ impl Solver<'_> {
             }
             Ok::<_, Error>(Rgb(planes.try_into().expect("three channels")))
         };
-        let white = given(&|group| self.diagonal(group, |m| m.operator.still))?;
-        let mut shaken = Vec::new();
-        for m in self.moving().filter(|m| !m.operator.still) {
+        let white = given(&|group| group.clone().zip(to).map(|(c, to)| Step::Copy(self.state.weight[c].clone(), to.clone())).collect())?;
+        let mut blurred = Vec::new();
+        for m in self.moving() {
             let own = given(&|group| {
                 let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
                 steps.extend(m.adjoint(self, &m.weight[group.clone()], to, 1.0));
                 steps
             })?;
-            shaken.push((own, power(&m.operator.psf)));
+            let power = match &m.operator.still {
+                Some(motion) => Power::Between(self.between(motion, m.operator.interpolation)),
+                None => Power::Same(power(&m.operator.psf)),
+            };
+            blurred.push((own, power));
         }
-        Ok(Precision { white, shaken })
+        Ok(Precision { white, blurred })
+    }
+
+    /// Of a displaced frame.
+    fn between(&self, motion: &DMat3, interpolation: Interpolation) -> Between {
+        let middle = |(w, h): (usize, usize)| 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
+        let motion = DMat3::from_translation(middle(self.frame)) * *motion * DMat3::from_translation(-middle(self.latent));
+        Between { motion, axis: (0..FRACTIONS).map(|k| axis_power(interpolation, k as f64 / FRACTIONS as f64)).collect() }
     }
 
     fn read_plane(&self, plane: &wgpu::Buffer) -> Result<Plane> {
@@ -119,7 +151,7 @@ impl Solver<'_> {
         let strength = STRENGTH * self.settings.lambda / super::Settings::default().lambda;
         let (mut precision, irradiance) = (self.precision()?, self.read(&self.state.irradiance)?);
         let offset = offset(&precision);
-        for given in precision.shaken.iter_mut().map(|s| &mut s.0).chain([&mut precision.white]) {
+        for given in precision.blurred.iter_mut().map(|s| &mut s.0).chain([&mut precision.white]) {
             for (weights, irradiance) in given.0.iter_mut().zip(&irradiance.0) {
                 weights.data.iter_mut().zip(&irradiance.data).for_each(|(w, e)| *w *= (e + offset).powi(2));
             }
@@ -131,5 +163,31 @@ impl Solver<'_> {
         let put = |(plane, to): (Plane, &wgpu::Buffer)| Step::Upload(Arc::new(plane.data), to.clone());
         self.gpu.submit(&irradiance.0.into_iter().zip(&self.state.irradiance).map(put).collect::<Vec<_>>());
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Along each axis by itself, and of the taps of both: the same.
+    #[test]
+    fn an_interpolation_has_the_power_of_its_taps() {
+        for kind in [Interpolation::Bilinear, Interpolation::Bicubic, Interpolation::SixPoint] {
+            for (fx, fy) in [(0.0, 0.0), (0.5, 0.0), (0.25, 0.9), (0.5, 0.5)] {
+                let support = kind.support() as i32;
+                let taps = || (1 - support..=support).map(f64::from);
+                let weight = |x: f64, y: f64| kind.weight(x - fx) * kind.weight(y - fy);
+                let psf: Vec<_> = taps().flat_map(|y| taps().map(move |x| (x, y))).map(|(x, y)| (x, y, weight(x, y))).collect();
+                let (whole, across, down) = (power(&psf), axis_power(kind, fx), axis_power(kind, fy));
+                for (k, p) in whole.iter().enumerate() {
+                    let product = across[k % SIDE] * down[k / SIDE];
+                    assert!((p - product).abs() < 1e-5, "{kind:?} at ({fx}, {fy}), coefficient {k}: {p}, not {product}");
+                }
+            }
+        }
+        // Nothing of the finest structure passes half-way between two pixels, and all of it on one.
+        let (half, on) = (axis_power(Interpolation::SixPoint, 0.5), axis_power(Interpolation::SixPoint, 0.0));
+        assert!(half[SIDE - 1] < 0.2 && half[0] > 0.99 && on.iter().all(|p| (p - 1.0).abs() < 1e-6), "{half:?}, {on:?}");
     }
 }

@@ -22,10 +22,13 @@ impl Planes {
     }
 }
 
-/// Inverse variances: of what is seen sharp; of each shaken frame with its power by frequency.
+/// Power of a frame at the 64 frequencies of the patch whose first pixel is (x, y).
+pub type Power = Box<dyn Fn(usize, usize) -> Vec<f64>>;
+
+/// Inverse variances: of what is seen sharp and in place; of each other frame with its power.
 pub struct Precision {
     pub white: Planes,
-    pub shaken: Vec<(Planes, Vec<f64>)>,
+    pub blurred: Vec<(Planes, Power)>,
 }
 
 const MIX: [[f64; 3]; 3] = [[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]];
@@ -128,8 +131,8 @@ fn pass(noisy: &Planes, basic: Option<&Planes>, precision: &Precision, strength:
                 let variance: Vec<f64> = (0..64)
                     .map(|k| {
                         let channel = |i: usize| {
-                            let p =
-                                mean(&precision.white, i) + precision.shaken.iter().map(|(p, power)| mean(p, i) * power[k]).sum::<f64>();
+                            let blurred = precision.blurred.iter().map(|(p, power)| mean(p, i) * power(x, y)[k]).sum::<f64>();
+                            let p = mean(&precision.white, i) + blurred;
                             strength * strength / p.max(1.0)
                         };
                         (0..3).map(|i| mix(c, i).powi(2) * channel(i)).sum()
@@ -170,10 +173,10 @@ fn enlarged(p: &Planes) -> Planes {
 }
 
 /// Both passes; images smaller than a patch with their last pixels repeated.
-pub fn filtered(log: &Planes, precision: &Precision, strength: f64) -> Planes {
+pub fn filtered(log: &Planes, precision: Precision, strength: f64) -> Planes {
     let large = enlarged(log);
-    let precision =
-        Precision { white: enlarged(&precision.white), shaken: precision.shaken.iter().map(|(p, s)| (enlarged(p), s.clone())).collect() };
+    let blurred = precision.blurred.into_iter().map(|(p, power)| (enlarged(&p), power)).collect();
+    let precision = Precision { white: enlarged(&precision.white), blurred };
     let n = large.width * large.height;
     let mixed: Vec<Vec<f64>> = (0..3).map(|c| (0..n).map(|i| (0..3).map(|k| mix(c, k) * large.values[k][i]).sum()).collect()).collect();
     let noisy = Planes { values: mixed, ..large };
