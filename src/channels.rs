@@ -18,6 +18,8 @@ const NOISE_GRADIENT: f64 = std::f64::consts::PI;
 const SEEN: f64 = 0.02;
 /// Information per frame, in parts of that of all three channels, that a choice of fewer has to bring: fewer are noisier, and less like the luminance.
 const GAIN: f64 = 1.15;
+/// The same where a file holds colour more coarsely than brightness: by themselves its channels show a blur that no camera made.
+const SUBSAMPLED_GAIN: f64 = 4.0;
 
 /// Pixels apart from those that all of `frames`, as they lie, clip in `channels`.
 fn known<'a>(frames: impl Iterator<Item = &'a Frame>, size: (usize, usize), channels: Channels) -> Vec<bool> {
@@ -45,6 +47,7 @@ fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: imp
 /// The channels whose mean tells most about the blurs of the frames `blurred` (no frame's is bought with another's), the scene being known from
 /// the frames `by`: indices into `frames`, whose exposures (1 = white) are `exposures`. All three channels where they clip together.
 pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: &[usize], noise: &NoiseModel) -> Channels {
+    let gain = if blurred.iter().chain(by).any(|&i| frames[i].chroma_subsampled) { SUBSAMPLED_GAIN } else { GAIN };
     let clipped = |c: Channels| -> Vec<Vec<bool>> { blurred.iter().map(|&i| mask::clipped(&frames[i], c)).collect() };
     let recorded = |clipped: &[Vec<bool>]| clipped.iter().flatten().filter(|c| !**c).count();
     let all = clipped(Channels::ALL);
@@ -59,7 +62,7 @@ pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: 
         let of = |(&i, clipped): (&usize, &Vec<bool>)| information(&exposures[i], channels, noise, |p| known[p] && !clipped[p]);
         blurred.iter().zip(clipped).map(|b| (1.0 + of(b)).ln()).sum::<f64>()
     };
-    let mut best = (told(Channels::ALL, &all) + blurred.len() as f64 * GAIN.ln(), Channels::ALL);
+    let mut best = (told(Channels::ALL, &all) + blurred.len() as f64 * gain.ln(), Channels::ALL);
     for (channels, clipped) in &others {
         let value = told(*channels, clipped);
         if value > best.0 {

@@ -12,6 +12,8 @@ pub struct Frame {
     pub intensity: Rgb,
     /// Number of intensity steps of the file: 255 for 8 bits, 65535 for 16 bits.
     pub levels: u32,
+    /// Whether the file holds colour more coarsely than brightness, as most JPEG files do (4:2:0, 4:2:2): no channel by itself is as sharp as their mean.
+    pub chroma_subsampled: bool,
     /// Exposure time Δt in seconds.
     pub exposure_time: f64,
 }

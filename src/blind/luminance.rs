@@ -45,16 +45,31 @@ const OUTLYING: f32 = 3.0;
 /// Exposure of a masked pixel above which it is masked for clipping.
 const CLIPPED: f32 = 0.5;
 
-/// Mean of squared residuals over noise variance of a frame at `latent`, over the pixels where `chosen` is true.
+/// So many pixels, or this part of all of them, decide nothing by themselves.
+const FEW: usize = 5;
+const FEW_OF: usize = 500;
+
+/// Mean of `squares`, of which the few largest count as the largest of the others: where an unseen pixel lies alone beside a burnt-out one its residual may
+/// be a hundred times the noise, whatever the blur.
+fn mean_without_outliers(mut squares: Vec<f32>) -> f64 {
+    let n = squares.len();
+    let few = FEW.max(n / FEW_OF);
+    if n > few {
+        let (_, most, _) = squares.select_nth_unstable_by(n - 1 - few, f32::total_cmp);
+        let most = *most;
+        squares.iter_mut().for_each(|s| *s = s.min(most));
+    }
+    squares.iter().copied().map(f64::from).sum::<f64>() / n as f64
+}
+
+/// Mean of squared residuals over noise variance of a frame at `latent`, over the pixels where `chosen` is true; no few of them decide it. NaN where there
+/// is none.
 pub fn chi_squared(frame: &Frame, operator: &Operator, latent: &Plane, chosen: &[bool]) -> f64 {
     let predicted = operator.forward(&latent.data);
     let inside = operator.inside();
-    let (mut sum, mut count) = (0.0f64, 0.0f64);
-    for p in (0..predicted.len()).filter(|&p| chosen[p] && inside[p] && frame.mask.data[p] > 0.0) {
-        sum += f64::from((frame.blurred.data[p] - predicted[p]).powi(2) / frame.variance.data[p]);
-        count += 1.0;
-    }
-    if count > 0.0 { sum / count } else { f64::NAN }
+    let counts = |p: &usize| chosen[*p] && inside[*p] && frame.mask.data[*p] > 0.0;
+    let square = |p: usize| (frame.blurred.data[p] - predicted[p]).powi(2) / frame.variance.data[p];
+    mean_without_outliers((0..predicted.len()).filter(counts).map(square).collect())
 }
 
 /// The frames and what is known of their blurs.
@@ -408,6 +423,19 @@ pub fn luminance_of(frames: &[Frame], tsfs: &[Tsf], merged: &Plane, pad: usize) 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_pixel_alone_decides_nothing() {
+        let of = |outliers: &[f32]| {
+            mean_without_outliers((0..1000 - outliers.len()).map(|i| 0.5 + i as f32 / 1000.0).chain(outliers.iter().copied()).collect())
+        };
+        assert!((of(&[]) - 1.0).abs() < 0.01);
+        assert!((of(&[9000.0, 400.0, 80.0]) - 1.0).abs() < 0.01);
+        // Ten do.
+        assert!((of(&[100.0; 10]) - 2.0).abs() < 0.02);
+        assert_eq!(mean_without_outliers(vec![4.0, 2.0]), 3.0);
+        assert!(mean_without_outliers(Vec::new()).is_nan());
+    }
     use crate::pose::Pose;
     use nalgebra::DMatrix;
 

@@ -165,7 +165,13 @@ pub(super) fn load(paths: &[PathBuf], given: Option<Vec<f64>>, white: f32) -> cr
     };
     let (mut frames, mut to_xyz, mut metadata) = (Vec::new(), Vec::new(), Vec::new());
     for ((input, name), exposure_time) in inputs.into_iter().zip(names(paths)).zip(times) {
-        frames.push(Frame { name, intensity: input.intensity, levels: input.levels, exposure_time });
+        frames.push(Frame {
+            name,
+            intensity: input.intensity,
+            levels: input.levels,
+            chroma_subsampled: input.chroma_subsampled,
+            exposure_time,
+        });
         to_xyz.push(input.to_xyz);
         metadata.push(input.metadata);
     }

@@ -27,6 +27,8 @@ pub struct Input {
     pub intensity: Rgb,
     /// Number of intensity steps.
     pub levels: u32,
+    /// See [`crate::exposure::Frame::chroma_subsampled`].
+    pub chroma_subsampled: bool,
     /// How intensity follows from light.
     pub encoding: Encoding,
     /// Linear RGB of this frame to XYZ relative to D50, white balance included.
@@ -96,6 +98,7 @@ pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
         return Ok(Input {
             intensity: raw.intensity,
             levels: 65535,
+            chroma_subsampled: false,
             encoding: Encoding::Linear,
             to_xyz: raw.to_xyz,
             metadata: raw.metadata,
@@ -121,7 +124,15 @@ pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
         Some(Profile { response: Response::Srgb, to_xyz, .. }) => (Encoding::Camera, to_xyz),
         Some(Profile { name, response, to_xyz }) => (Encoding::Profile(name, response), to_xyz),
     };
-    Ok(Input { intensity: picture.intensity, levels: picture.levels, encoding, to_xyz, metadata, raw: false })
+    Ok(Input {
+        intensity: picture.intensity,
+        levels: picture.levels,
+        chroma_subsampled: picture.chroma_subsampled,
+        encoding,
+        to_xyz,
+        metadata,
+        raw: false,
+    })
 }
 
 /// A linear image of any brightness.
@@ -170,7 +181,7 @@ fn linear(path: &Path, image: Rgb, white: f32, to_xyz: Matrix, metadata: Metadat
         }
     }
     let intensity = image.map_planes(|p| p.map(|v| (v / white).clamp(0.0, 1.0)));
-    Ok(Input { intensity, levels: ldr::FLOAT_LEVELS, encoding: Encoding::Linear, to_xyz, metadata, raw: false })
+    Ok(Input { intensity, levels: ldr::FLOAT_LEVELS, chroma_subsampled: false, encoding: Encoding::Linear, to_xyz, metadata, raw: false })
 }
 
 /// Pixels of a Radiance HDR file, and their RGB to XYZ relative to D50: by its PRIMARIES, without them Rec. 709, which is what programs

@@ -16,6 +16,8 @@ pub struct Picture {
     pub intensity: Rgb,
     /// Number of intensity steps: 255 for 8 bits, 65535 for 16 bits, [`FLOAT_LEVELS`] for floating point.
     pub levels: u32,
+    /// Whether the file holds colour more coarsely than brightness (JPEG).
+    pub chroma_subsampled: bool,
     /// Whether the file holds floating-point numbers: those are linear, and may be above 1.
     pub float: bool,
     /// The ICC profile that the file embeds.
@@ -48,10 +50,12 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
         }
         None => return Err(format("is not a picture that can be read; frames are 8- or 16-bit PNG, JPEG or TIFF files".into())),
     }
+    let jpeg = (reader.format() == Some(ImageFormat::Jpeg)).then(|| jpeg_segments(bytes).collect::<Vec<_>>());
     // The JPEG decoder fills what is missing with grey and reports success.
-    if reader.format() == Some(ImageFormat::Jpeg) && !jpeg_is_complete(bytes) {
+    if jpeg.as_ref().is_some_and(|segments| segments.iter().all(|s| s.0 != END_OF_IMAGE)) {
         return Err(format("is truncated; copy it again from the camera".into()));
     }
+    let chroma_subsampled = jpeg.is_some_and(|segments| is_subsampled(&segments));
     let mut decoder = reader.into_decoder().map_err(|e| format(reason(&e)))?;
     let (width, height) = decoder.dimensions();
     super::check_size(width as usize, height as usize, bytes.len()).map_err(format)?;
@@ -70,15 +74,15 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
     match &picture {
         DynamicImage::ImageLuma8(_) | DynamicImage::ImageLumaA8(_) | DynamicImage::ImageRgb8(_) | DynamicImage::ImageRgba8(_) => {
             let raw = picture.into_rgb8().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255, float: false, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255, chroma_subsampled, float: false, icc })
         }
         DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) | DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => {
             let raw = picture.into_rgb16().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535, float: false, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535, chroma_subsampled, float: false, icc })
         }
         _ => {
             let raw = picture.into_rgb32f().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 1.0), levels: FLOAT_LEVELS, float: true, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 1.0), levels: FLOAT_LEVELS, chroma_subsampled, float: true, icc })
         }
     }
 }
@@ -103,23 +107,39 @@ fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Whether a JPEG's last scan ends with the end-of-image marker. Walks the segments, because thumbnails inside the
-/// metadata have end markers of their own and cameras append data behind the last one.
-fn jpeg_is_complete(bytes: &[u8]) -> bool {
+/// Marker of a JPEG's last segment.
+const END_OF_IMAGE: u8 = 0xD9;
+
+/// Markers of a JPEG's segments and what they hold, up to the end-of-image marker. Walks from one to the next, because thumbnails inside the metadata have
+/// markers of their own and cameras append data behind the last one.
+fn jpeg_segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     let mut at = 2; // behind the start-of-image marker, by which the format was told
-    loop {
+    std::iter::from_fn(move || {
         // The next marker: 0xFF, then neither 0 (a stuffed data byte), nor 0xFF (padding), nor RST0..RST7.
         let marker = loop {
-            let (Some(&a), Some(&b)) = (bytes.get(at), bytes.get(at + 1)) else { return false };
+            let (&a, &b) = (bytes.get(at)?, bytes.get(at + 1)?);
             if a == 0xFF && b != 0 && b != 0xFF && !(0xD0..=0xD7).contains(&b) {
                 break b;
             }
             at += 1;
         };
-        if marker == 0xD9 {
-            return true;
+        if marker == END_OF_IMAGE {
+            at = bytes.len();
+            return Some((marker, &[][..]));
         }
-        let (Some(&high), Some(&low)) = (bytes.get(at + 2), bytes.get(at + 3)) else { return false };
-        at += 2 + usize::from(u16::from_be_bytes([high, low]));
-    }
+        let (&high, &low) = (bytes.get(at + 2)?, bytes.get(at + 3)?);
+        let (first, last) = (at + 4, at + 2 + usize::from(u16::from_be_bytes([high, low])));
+        at = last;
+        Some((marker, bytes.get(first..last).unwrap_or_default()))
+    })
+}
+
+/// Whether the frame header of a JPEG gives its first component, brightness, more samples than another.
+fn is_subsampled(segments: &[(u8, &[u8])]) -> bool {
+    // SOF0..SOF15 without DHT, JPG and DAC: precision, height, width, number of components; of each its name, samples across and down, table.
+    let header = segments.iter().find(|(marker, _)| (0xC0..=0xCF).contains(marker) && ![0xC4, 0xC8, 0xCC].contains(marker));
+    let samples = |component: &[u8]| (component[1] >> 4) * (component[1] & 15);
+    let Some(components) = header.and_then(|(_, content)| content.get(6..)) else { return false };
+    let mut samples = components.chunks_exact(3).map(samples);
+    samples.next().is_some_and(|first| samples.any(|other| other < first))
 }

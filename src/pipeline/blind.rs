@@ -219,12 +219,12 @@ struct Shown {
     unlike: f64,
 }
 
-/// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.76 and more, but for a soft lens, 0.65 and a
-/// blur that is round (0.08).
-const ONE_SET_FREE: Shown = Shown { left: 0.73, unlike: 0.25 };
-/// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
-/// to 0.89, differ by 0.14 and more, and cost 1.07 and more.
-const SEVERAL_SET_FREE: Shown = Shown { left: 0.9, unlike: 0.12 };
+/// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.84 and more, but for a soft lens, 0.65 and a
+/// blur that is round (0.08); frames of 1.5 px 0.79 to 0.93.
+const ONE_SET_FREE: Shown = Shown { left: 0.80, unlike: 0.25 };
+/// Where several were: sharp ones leave 0.89 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
+/// to 0.84, differ by 0.14 and more, and cost 1.07 and more.
+const SEVERAL_SET_FREE: Shown = Shown { left: 0.87, unlike: 0.12 };
 /// [`blind::Freed::held_out`] at most, whatever the noise: what the frames do not agree about beyond is no motion.
 const AGREED: f64 = 300.0;
 /// The same times the variance of shot noise at white: aliasing leaves up to 9 at a full well of 4000 electrons, and as much more as there is less noise.

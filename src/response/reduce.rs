@@ -44,7 +44,12 @@ pub fn reduced(bracket: &Bracket, response: &Response, divisor: usize) -> Result
                 forward(&curve, sum / (divisor * divisor) as f64) as f32
             })
         }));
-        Frame { name: f.name.clone(), intensity, levels: (f.levels * divisor as u32).min(65535), exposure_time: f.exposure_time }
+        Frame {
+            intensity,
+            levels: (f.levels * divisor as u32).min(65535),
+            chroma_subsampled: f.chroma_subsampled && divisor == 1,
+            ..f.clone()
+        }
     });
     Bracket::new(frames.collect())
 }

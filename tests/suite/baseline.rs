@@ -10,8 +10,13 @@ use unshaken::synth::{self, Camera, Tremor};
 
 /// Flat frames of the given intensities, at 1/10, 1 and 4 s.
 fn bracket(levels: [f32; 3]) -> Bracket {
-    let frame =
-        |(level, exposure_time): (f32, f64)| Frame { name: "flat".into(), intensity: Rgb::filled(3, 2, level), levels: 255, exposure_time };
+    let frame = |(level, exposure_time): (f32, f64)| Frame {
+        name: "flat".into(),
+        intensity: Rgb::filled(3, 2, level),
+        levels: 255,
+        chroma_subsampled: false,
+        exposure_time,
+    };
     Bracket::new(levels.into_iter().zip([0.1, 1.0, 4.0]).map(frame).collect()).unwrap()
 }
 

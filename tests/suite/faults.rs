@@ -294,7 +294,13 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
         let path = folder.join(format!("img0{i}.jpg"));
         let picture = ldr::read(&path).unwrap();
         let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
-        Frame { name: format!("img0{i}.jpg"), intensity: picture.intensity, levels: picture.levels, exposure_time }
+        Frame {
+            name: format!("img0{i}.jpg"),
+            intensity: picture.intensity,
+            levels: picture.levels,
+            chroma_subsampled: picture.chroma_subsampled,
+            exposure_time,
+        }
     };
     let whole = Bracket::new((0..4).map(read).collect()).unwrap();
     let response = response::automatic(&whole).unwrap().response;

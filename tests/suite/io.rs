@@ -112,6 +112,28 @@ fn jpegs_may_carry_thumbnails_and_data_behind_their_end() {
     assert_eq!(ldr::read(&path).unwrap().intensity.size(), (32, 16));
 }
 
+/// By the frame header of the picture itself, not of a thumbnail in its metadata.
+#[test]
+fn a_jpeg_that_holds_colour_coarsely_is_told() {
+    let picture = DynamicImage::ImageRgb8(image::RgbImage::from_fn(32, 16, |x, y| image::Rgb([x as u8, 8 * y as u8, 9])));
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("a.jpg");
+    // SOF0 of a picture of 8 x 8 pixels with components of 2 x 2, 1 x 1 and 1 x 1 samples.
+    let header = [0xFF, 0xC0, 0, 17, 8, 0, 8, 0, 8, 3, 1, 0x22, 0, 2, 0x11, 1, 3, 0x11, 1];
+    with_exif(&path, &picture, &[(exif::Tag::ImageDescription, exif::Value::Ascii(vec![header.to_vec()]))]);
+    assert!(!ldr::read(&path).unwrap().chroma_subsampled, "4:4:4");
+    let mut bytes = std::fs::read(&path).unwrap();
+    let tail = |bytes: &[u8], marker: [u8; 2]| bytes.windows(2).rposition(|w| w == marker).unwrap();
+    let at = tail(&bytes, [0xFF, 0xC0]);
+    assert_eq!(bytes[at + 9..at + 12], [3, bytes[at + 10], 0x11], "three components");
+    // Four blocks of brightness for one of each colour, where the file has one: enough data for the first quarter of them.
+    for samples in [0x22, 0x21] {
+        bytes[at + 11] = samples;
+        std::fs::write(&path, &bytes).unwrap();
+        assert!(ldr::read(&path).unwrap().chroma_subsampled, "{samples:x}");
+    }
+}
+
 #[test]
 fn exposure_times_come_from_exif() {
     let dir = tempdir().unwrap();

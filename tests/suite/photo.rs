@@ -714,7 +714,13 @@ fn layers_lie_on_the_pixels_of_the_result() {
             let plane = Plane::from_fn(w, h, |x, y| {
                 if x.abs_diff(at) < 3 && y.abs_diff(10) < 3 { (2.0 * time as f32).min(1.0) } else { 0.1 * time as f32 }
             });
-            Frame { name: name.into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time: time }
+            Frame {
+                name: name.into(),
+                intensity: Rgb([plane.clone(), plane.clone(), plane]),
+                levels: 65535,
+                chroma_subsampled: false,
+                exposure_time: time,
+            }
         };
     let bracket = Bracket::new(vec![frame("a", 0.25, 20), frame("b", 1.0, 25)]).unwrap();
     let shift = glam::DMat3::from_translation(glam::DVec2::new(5.0, 0.0));

@@ -236,7 +236,13 @@ fn real_frames_that_are_sharp_are_registered_and_pass_for_sharp() {
             let path = folder.join(format!("{file}.jpg"));
             let picture = ldr::read(&path).unwrap();
             let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
-            Frame { name: file.into(), intensity: picture.intensity, levels: picture.levels, exposure_time }
+            Frame {
+                name: file.into(),
+                intensity: picture.intensity,
+                levels: picture.levels,
+                chroma_subsampled: picture.chroma_subsampled,
+                exposure_time,
+            }
         };
         let bracket = Bracket::new(files.split(' ').map(read).collect()).unwrap();
         let response = automatic(&bracket).unwrap().response;

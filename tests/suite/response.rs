@@ -37,7 +37,13 @@ fn office_agrees_with_opencv() {
         let path = folder.join(format!("office_{i}.jpg"));
         let picture = ldr::read(&path).unwrap();
         let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
-        Frame { name: format!("office_{i}.jpg"), intensity: picture.intensity, levels: picture.levels, exposure_time }
+        Frame {
+            name: format!("office_{i}.jpg"),
+            intensity: picture.intensity,
+            levels: picture.levels,
+            chroma_subsampled: picture.chroma_subsampled,
+            exposure_time,
+        }
     });
     let response = calibrate(&Bracket::new(frames.collect()).unwrap()).unwrap();
     assert_rises(&response);
@@ -68,7 +74,7 @@ fn noisy_bracket(f: fn(f64) -> f64, width: usize, height: usize, full_well: f64,
             })
         };
         let intensity = Rgb([1.0, 0.7, 0.4].map(|gain| plane(gain, &mut noise)));
-        Frame { name: format!("{exposure_time:.3}"), intensity, levels: 255, exposure_time }
+        Frame { name: format!("{exposure_time:.3}"), intensity, levels: 255, chroma_subsampled: false, exposure_time }
     });
     Bracket::new(frames.to_vec()).unwrap()
 }
@@ -122,6 +128,7 @@ fn frames_that_share_no_shades_are_refused() {
         name: format!("{exposure_time}.png"),
         intensity: Rgb::filled(32, 32, value),
         levels: 255,
+        chroma_subsampled: false,
         exposure_time,
     };
     let error = calibrate(&Bracket::new(vec![frame(0.0, 0.001), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
@@ -258,14 +265,26 @@ fn few_shades_give_a_gamma_and_say_so() {
             let e = 0.2 + 0.05 * ((x / 16) as f64 + 3.0 * (y / 16) as f64);
             (((e * exposure_time * 4.0).min(1.0).powf(1.0 / 1.8) * 255.0).round() / 255.0) as f32
         });
-        Frame { name: "patches".into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 255, exposure_time }
+        Frame {
+            name: "patches".into(),
+            intensity: Rgb([plane.clone(), plane.clone(), plane]),
+            levels: 255,
+            chroma_subsampled: false,
+            exposure_time,
+        }
     });
     let found = automatic(&Bracket::new(frames.to_vec()).unwrap()).unwrap();
     assert!(found.poor.as_ref().is_some_and(|p| p.contains("gamma")), "{found:?}");
     let exponent = found.response.inverse(1, 128.0 / 255.0).ln() / (128.0f64 / 255.0).ln();
     assert!((exponent - 1.8).abs() < 0.1, "{exponent}");
     // Without a pair of frames that share shades there is nothing to go by.
-    let frame = |value: f32, exposure_time| Frame { name: "one".into(), intensity: Rgb::filled(48, 48, value), levels: 255, exposure_time };
+    let frame = |value: f32, exposure_time| Frame {
+        name: "one".into(),
+        intensity: Rgb::filled(48, 48, value),
+        levels: 255,
+        chroma_subsampled: false,
+        exposure_time,
+    };
     let error = automatic(&Bracket::new(vec![frame(0.0, 0.01), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
     assert!(error.contains("--response"), "{error}");
 }
@@ -301,7 +320,13 @@ fn correct_real_brackets_raise_no_alarm() {
         let path = folder.join(format!("{n}.jpg"));
         let picture = ldr::read(&path).unwrap();
         let exposure_time = metadata::exposure_time(&path).unwrap().unwrap();
-        Frame { name: n.into(), intensity: picture.intensity, levels: picture.levels, exposure_time }
+        Frame {
+            name: n.into(),
+            intensity: picture.intensity,
+            levels: picture.levels,
+            chroma_subsampled: picture.chroma_subsampled,
+            exposure_time,
+        }
     });
     let bracket = Bracket::new(frames.to_vec()).unwrap();
     let found = automatic(&bracket).unwrap();

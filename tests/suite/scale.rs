@@ -205,6 +205,7 @@ fn frames(size: (usize, usize), value: impl Fn(usize, usize) -> f32 + Copy + Syn
             Plane::from_fn(size.0, size.1, |x, y| ((factor * value(x, y)).min(1.0) * 255.0).round() / 255.0)
         })),
         levels: 255,
+        chroma_subsampled: false,
         exposure_time,
     };
     Bracket::new(vec![frame("a.png", 0.5, 0.5), frame("b.png", 1.0, 1.0)]).expect("a bracket")

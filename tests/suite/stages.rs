@@ -42,7 +42,13 @@ fn the_noise_level_is_found_within_a_fifth() {
             let z = e + truth.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0;
             (z.clamp(0.0, 1.0) * 65535.0).round() as f32 / 65535.0
         });
-        let frame = Frame { name: "flat".into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time: 1.0 };
+        let frame = Frame {
+            name: "flat".into(),
+            intensity: Rgb([plane.clone(), plane.clone(), plane]),
+            levels: 65535,
+            chroma_subsampled: false,
+            exposure_time: 1.0,
+        };
         let exposure = noise::exposure(&frame, &Response::Linear);
         let found = noise::estimate(&[frame], &[exposure], &Response::Linear);
         for x in [0.02, 0.1, 0.5] {
@@ -66,7 +72,13 @@ fn texture_that_two_frames_share_is_no_noise() {
             let z = e + truth.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0;
             (z.clamp(0.0, 1.0) * 65535.0).round() as f32 / 65535.0
         });
-        Frame { name: "grain".into(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time }
+        Frame {
+            name: "grain".into(),
+            intensity: Rgb([plane.clone(), plane.clone(), plane]),
+            levels: 65535,
+            chroma_subsampled: false,
+            exposure_time,
+        }
     };
     let frames = [frame(1.0, 300), frame(0.4, 400)];
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
@@ -99,7 +111,7 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
             picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
         }
         let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
-        Frame { name: "grey".into(), intensity: Rgb([plane(0), plane(1), plane(2)]), levels: 255, exposure_time }
+        Frame { name: "grey".into(), intensity: Rgb([plane(0), plane(1), plane(2)]), levels: 255, chroma_subsampled: false, exposure_time }
     };
     for (quality, smoothed) in [(Some(75), true), (Some(90), true), (None, false)] {
         let frames = [frame(0.4, 500, quality), frame(1.0, 600, quality)];
@@ -125,6 +137,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         name: "one".into(),
         intensity: Rgb(rgb.map(|v| Plane::filled(1, 1, v))),
         levels: 255,
+        chroma_subsampled: false,
         exposure_time,
     };
     let one = |frames: &[Frame], sharp: &[bool]| {
@@ -152,7 +165,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
 fn what_is_clipped_in_some_channels_counts_by_the_grey_of_all() {
     let pixels = [[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 1.0, 0.5], [1.0; 3], [0.0; 3], [1.0, 0.99, 0.2]];
     let intensity = Rgb([0, 1, 2].map(|c| Plane { width: pixels.len(), height: 1, data: pixels.iter().map(|p| p[c]).collect() }));
-    let frame = Frame { name: "one".into(), intensity, levels: 255, exposure_time: 1.0 };
+    let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, exposure_time: 1.0 };
     let mask = Plane { width: pixels.len(), height: 1, data: vec![0.8, 0.0, 0.0, 0.0, 0.0, 0.0] };
     let found = mask::with_partly_clipped(&mask, &frame, 0.3, 0.5).data;
     // Greys of 0.65, 0.943 and 0.903: the first in the flat part of the window, the others 0.057 and 0.097 from its end.
@@ -188,7 +201,7 @@ fn a_blur_is_looked_for_in_the_channels_that_tell_of_it() {
                     (e * exposure_time as f32).min(1.0)
                 })
             };
-            Frame { name: "tinted".into(), intensity: Rgb([0, 1, 2].map(plane)), levels: 65535, exposure_time }
+            Frame { name: "tinted".into(), intensity: Rgb([0, 1, 2].map(plane)), levels: 65535, chroma_subsampled: false, exposure_time }
         };
         times.map(frame).to_vec()
     };
@@ -205,6 +218,10 @@ fn a_blur_is_looked_for_in_the_channels_that_tell_of_it() {
     // Lamps whose red no frame knows, and little is far from them; blue is known everywhere.
     let lamps = bracket([0.3, 0.05, 0.05], 10.0, [1.0, 1.1]);
     assert_eq!(chosen(&lamps, &[0, 1], &[0, 1]), ["green", "blue"], "lamps of unknown red");
+    // A file that holds colour coarsely blurs channels by themselves: one of them is looked at only where the mean of all shows next to nothing.
+    let coarse = |frames: Vec<Frame>| -> Vec<Frame> { frames.into_iter().map(|f| Frame { chroma_subsampled: true, ..f }).collect() };
+    assert_eq!(chosen(&coarse(lamps), &[0, 1], &[0, 1]), ["red", "green", "blue"], "lamps of unknown red, colour coarse");
+    assert_eq!(chosen(&coarse(long), &[1], &[0]), ["blue"], "all but blue clipped, colour coarse");
 }
 
 #[test]
@@ -323,7 +340,13 @@ fn a_frame_that_none_can_be_compared_with_is_not_taken_for_sharp() {
             let e = exposure_time * light(x, y);
             (e + level.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0).clamp(0.0, 1.0) as f32
         });
-        Frame { name: String::new(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 65535, exposure_time }
+        Frame {
+            name: String::new(),
+            intensity: Rgb([plane.clone(), plane.clone(), plane]),
+            levels: 65535,
+            chroma_subsampled: false,
+            exposure_time,
+        }
     };
     let sharp = |times: &[f64]| {
         let frames: Vec<Frame> = times.iter().zip([10, 30, 50]).map(|(t, seed)| frame(*t, seed)).collect();
@@ -365,7 +388,13 @@ fn codes_of_a_dark_frame_and_noise_of_all_channels_alike_are_no_fine_structure()
             let e = exposure_time * light * soft(x, y);
             code(e + level.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0)
         });
-        Frame { name: String::new(), intensity: Rgb([plane.clone(), plane.clone(), plane]), levels: 255, exposure_time }
+        Frame {
+            name: String::new(),
+            intensity: Rgb([plane.clone(), plane.clone(), plane]),
+            levels: 255,
+            chroma_subsampled: false,
+            exposure_time,
+        }
     };
     let verdicts = |full_well: f64, light: f64, softness: isize| {
         let level = noise::NoiseModel::from_electrons(full_well, 2.0);
@@ -423,7 +452,7 @@ fn edges_are_even_behind_a_soft_lens_and_uneven_after_a_motion() {
     let moved = [(1, 0), (0, 1), (1, 1), (1, -1)].map(|(dx, dy)| mean(&scene, &along(dx, dy, 1)));
     let of = |plane: &Plane| {
         let intensity = Rgb([plane.clone(), plane.clone(), plane.clone()]);
-        let frame = Frame { name: String::new(), intensity, levels: 65535, exposure_time: 1.0 };
+        let frame = Frame { name: String::new(), intensity, levels: 65535, chroma_subsampled: false, exposure_time: 1.0 };
         let exposures = [noise::exposure(&frame, &Response::Linear)];
         let frames = [frame];
         let found =
