@@ -7,8 +7,8 @@
 //! that stands out of its noise, stays; total variation, which only knows that edges are few, cannot tell fine texture from noise.
 //!
 //! The variance of a coefficient is `1 / (p + Σ_i p_i P_i)`: p is the inverse variance that sharp frames in place give, p_i what frame i, shaken or
-//! displaced, gives where its blur or interpolation passes all ([`Precision`]), P_i the power of that at the coefficient's frequency. Channels are filtered in an orthonormal
-//! opponent space, in stacks that the sum of the channels chooses.
+//! displaced, gives where its blur or interpolation passes all ([`Precision`]), P_i the power of that at the coefficient's frequency. Channels are
+//! filtered in an orthonormal opponent space, in stacks that the sum of the channels chooses.
 
 use crate::image::{Plane, Rgb};
 use crate::pose::project;

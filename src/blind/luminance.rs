@@ -423,6 +423,8 @@ pub fn luminance_of(frames: &[Frame], tsfs: &[Tsf], merged: &Plane, pad: usize) 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pose::Pose;
+    use nalgebra::DMatrix;
 
     #[test]
     fn a_pixel_alone_decides_nothing() {
@@ -436,8 +438,6 @@ mod tests {
         assert_eq!(mean_without_outliers(vec![4.0, 2.0]), 3.0);
         assert!(mean_without_outliers(Vec::new()).is_nan());
     }
-    use crate::pose::Pose;
-    use nalgebra::DMatrix;
 
     #[test]
     fn draws_scatter_as_the_inverse_of_the_normal_equations() {

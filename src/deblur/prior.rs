@@ -83,11 +83,12 @@ const OFFSET: f32 = 20.0;
 /// `OFFSET` standard deviations of irradiance where it is known best: the hundredth part of the largest of `weights`, by a sample.
 fn offset(weights: &Precision) -> f32 {
     let n = weights.white.0[0].data.len();
+    let blurred: Vec<(&Rgb, f32)> = weights.blurred.iter().map(|(given, power)| (given, power.mean())).collect();
     let mut sample = Vec::new();
     for c in 0..3 {
         sample.extend((0..n).step_by(n.div_ceil(100_000)).map(|i| {
-            let through = |(given, power): &(Rgb, Power)| given.0[c].data[i] * power.mean();
-            weights.white.0[c].data[i] + weights.blurred.iter().map(through).sum::<f32>()
+            let through = |(given, power): &(&Rgb, f32)| given.0[c].data[i] * power;
+            weights.white.0[c].data[i] + blurred.iter().map(through).sum::<f32>()
         }));
     }
     sample.retain(|w| *w > 0.0);

@@ -31,7 +31,7 @@ const TABLE: &[(&str, &[&str])] = &[
     // The device, its operators, the solver.
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
-    ("collaborative", &["image", "sampling"]),
+    ("collaborative", &["image", "pose::project", "sampling"]),
     ("deblur", &["error", "image", "pose", "collaborative", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
     // All stages in order. Of the kernels it only opens the set.
     (
