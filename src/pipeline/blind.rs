@@ -222,9 +222,12 @@ struct Shown {
 /// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.84 and more, but for a soft lens, 0.65 and a
 /// blur that is round (0.08); frames of 1.5 px 0.79 to 0.93.
 const ONE_SET_FREE: Shown = Shown { left: 0.80, unlike: 0.25 };
-/// Where several were: sharp ones leave 0.89 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
+/// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
 /// to 0.84, differ by 0.14 and more, and cost 1.07 and more.
-const SEVERAL_SET_FREE: Shown = Shown { left: 0.87, unlike: 0.12 };
+const SEVERAL_SET_FREE: Shown = Shown { left: 0.86, unlike: 0.12 };
+/// [`Shown::left`] at most where files hold colour more coarsely than brightness: what JPEG takes from sharp frames differs from one to the next, and passes
+/// for a blur that leaves 0.87 and more.
+const LEFT_OF_JPEG: f64 = 0.80;
 /// [`blind::Freed::held_out`] at most, whatever the noise: what the frames do not agree about beyond is no motion.
 const AGREED: f64 = 300.0;
 /// The same times the variance of shot noise at white: aliasing leaves up to 9 at a full well of 4000 electrons, and as much more as there is less noise.
@@ -749,9 +752,11 @@ impl Run<'_> {
         })
         .ok_or(Error::Cancelled)?;
         let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
+        let coarse = used.iter().any(|&i| self.bracket.frames()[i].chroma_subsampled);
+        let most = if coarse { line.left.min(LEFT_OF_JPEG) } else { line.left };
         let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
         let moved = longest > SHAKEN && longest < TOO_FAR;
-        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
+        let likely = moved && found.left < most && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
