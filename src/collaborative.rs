@@ -235,19 +235,18 @@ impl Pass<'_> {
     /// Variances of the coefficients of the patch at `at`, by opponent channel.
     #[inline(always)]
     fn variances(&self, at: (usize, usize)) -> [Patch; 3] {
-        let powers: Vec<Patch> = self.precision.blurred.iter().map(|(_, power)| power.at(at)).collect();
-        let mut channels = [[0f32; VALUES]; 3];
-        for (c, channel) in channels.iter_mut().enumerate() {
-            *channel = [Self::mean(&self.precision.white.0[c], at); VALUES];
-            for ((given, _), power) in self.precision.blurred.iter().zip(&powers) {
-                let given = Self::mean(&given.0[c], at);
+        let mut channels: [Patch; 3] = std::array::from_fn(|c| [Self::mean(&self.precision.white.0[c], at); VALUES]);
+        for (given, power) in &self.precision.blurred {
+            let power = power.at(at);
+            for (channel, given) in channels.iter_mut().zip(&given.0) {
+                let given = Self::mean(given, at);
                 for k in 0..VALUES {
                     channel[k] += given * power[k];
                 }
             }
-            for value in channel {
-                *value = self.strength * self.strength / value.max(1.0 / (UNKNOWN * UNKNOWN));
-            }
+        }
+        for value in channels.as_flattened_mut() {
+            *value = self.strength * self.strength / value.max(1.0 / (UNKNOWN * UNKNOWN));
         }
         let mut mixed = [[0f32; VALUES]; 3];
         for (out, row) in mixed.iter_mut().zip(&self.opponent) {

@@ -9,7 +9,6 @@ use crate::kernels::DeviceRgb;
 use crate::tsf::Interpolation;
 use glam::{DMat3, DVec2};
 use serde::{Deserialize, Serialize};
-use std::ops::Range;
 use std::sync::Arc;
 
 /// What irradiance is taken to look like before a frame is seen.
@@ -99,32 +98,27 @@ fn offset(weights: &Precision) -> f32 {
 impl Solver<'_> {
     /// Inverse variance of irradiance that the frames give at the present estimate.
     fn precision(&self) -> Result<Precision> {
-        let to = &self.state.product;
         self.gpu.submit(&self.weigh(self.settings.robust));
-        // What `steps` of each group of channels leave in `product`. The interpolation has negative lobes.
-        let given = |steps: &dyn Fn(&Range<usize>) -> Vec<Step>| {
+        let white = self.read(&self.state.weight)?;
+        let to = &self.state.product;
+        let mut blurred = Vec::new();
+        for m in self.moving() {
             let mut planes = Vec::new();
             for group in self.groups() {
-                self.gpu.submit(&steps(&group));
+                let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
+                steps.extend(m.adjoint(self, &m.weight[group], to, 1.0));
+                self.gpu.submit(&steps);
                 for plane in to {
+                    // The interpolation has negative lobes.
                     planes.push(self.read_plane(plane)?.map(|w| w.max(0.0)));
                 }
             }
-            Ok::<_, Error>(Rgb(planes.try_into().expect("three channels")))
-        };
-        let white = given(&|group| group.clone().zip(to).map(|(c, to)| Step::Copy(self.state.weight[c].clone(), to.clone())).collect())?;
-        let mut blurred = Vec::new();
-        for m in self.moving() {
-            let own = given(&|group| {
-                let mut steps: Vec<Step> = to.iter().map(|b| Step::Clear(b.clone())).collect();
-                steps.extend(m.adjoint(self, &m.weight[group.clone()], to, 1.0));
-                steps
-            })?;
+            let given = Rgb(planes.try_into().expect("three channels"));
             let power = match &m.operator.still {
                 Some(motion) => Power::Between(self.between(motion, m.operator.interpolation)),
                 None => Power::Same(power(&m.operator.psf)),
             };
-            blurred.push((own, power));
+            blurred.push((given, power));
         }
         Ok(Precision { white, blurred })
     }

@@ -45,10 +45,11 @@ pub fn reduced(bracket: &Bracket, response: &Response, divisor: usize) -> Result
             })
         }));
         Frame {
+            name: f.name.clone(),
             intensity,
             levels: (f.levels * divisor as u32).min(65535),
             chroma_subsampled: f.chroma_subsampled && divisor == 1,
-            ..f.clone()
+            exposure_time: f.exposure_time,
         }
     });
     Bracket::new(frames.collect())
