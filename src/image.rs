@@ -11,6 +11,9 @@ impl Channels {
     /// Red, green and blue.
     pub const ALL: Self = Self([true; 3]);
 
+    /// Red, green and blue, one at a time.
+    pub const EACH: [Self; 3] = [Self([true, false, false]), Self([false, true, false]), Self([false, false, true])];
+
     /// Every choice there is, all three first.
     pub fn choices() -> impl Iterator<Item = Self> {
         (1..8u8).rev().map(|bits| Self(std::array::from_fn(|c| bits & (4 >> c) != 0)))

@@ -24,6 +24,7 @@ pub mod error;
 pub mod experiments;
 pub mod exposure;
 mod fft;
+pub mod ghosts;
 pub mod gpu;
 pub mod image;
 pub mod io;

@@ -35,13 +35,31 @@ pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
     (0..planes[0].data.len()).into_par_iter().map(|i| channels.indices().any(|c| planes[c].data[i] >= CLIPPED)).collect()
 }
 
+/// Pixels from a clipped one up to which it spoils the colour of a file that holds colour at half the resolution, and interpolates it.
+const SPOILT: usize = 2;
+
+/// Where any of `channels` of the frame is clipped, or mixed with neighbours that are.
+pub fn spoilt(frame: &Frame, channels: Channels) -> Vec<bool> {
+    let found = clipped(frame, channels);
+    if !frame.chroma_subsampled {
+        return found;
+    }
+    let near = apart(&found, frame.intensity.size(), SPOILT);
+    near.into_iter().map(|apart| !apart).collect()
+}
+
+/// [`spoilt`] of red, green and blue, each by itself.
+pub fn spoilt_channels(frame: &Frame) -> [Vec<bool>; 3] {
+    Channels::EACH.map(|c| spoilt(frame, c))
+}
+
 /// `mask`, which is 0 where any channel of `frame` is clipped, for those who take each channel by itself: where some are clipped and others are
-/// not, the window's high end at the grey of them all, times `share`. The colour of a lamp or of the sky is clipped in one channel long before it is
+/// not, the window's high end at the grey of them all, times `share` there. The colour of a lamp or of the sky is clipped in one channel long before it is
 /// in the others, which no other frame may show as well.
-pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: f32) -> Plane {
-    let (grey, planes) = (grey(frame, Channels::ALL), &frame.intensity.0);
-    let one = |p: usize| match planes.iter().filter(|c| c.data[p] >= CLIPPED).count() {
-        1 | 2 => share * low_taper(1.0 - grey.data[p], alpha),
+pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: impl Fn(usize) -> f32 + Sync) -> Plane {
+    let (grey, clipped) = (grey(frame, Channels::ALL), spoilt_channels(frame));
+    let one = |p: usize| match clipped.iter().filter(|c| c[p]).count() {
+        1 | 2 => share(p) * low_taper(1.0 - grey.data[p], alpha),
         _ => mask.data[p],
     };
     Plane { data: (0..mask.data.len()).into_par_iter().map(one).collect(), ..grey }
@@ -50,7 +68,7 @@ pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: f32) 
 /// [`masks`] of all channels, each frame's [`with_partly_clipped`]: how frames count in the solver.
 pub fn counting(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3]) -> Vec<Plane> {
     let all = masks(frames, sharp, alpha, motions, Channels::ALL);
-    all.iter().zip(frames).map(|(m, f)| with_partly_clipped(m, f, alpha, 1.0)).collect()
+    all.iter().zip(frames).map(|(m, f)| with_partly_clipped(m, f, alpha, |_| 1.0)).collect()
 }
 
 /// Distance in pixels from what no frame knows up to which its light, blurred, is counted with.
@@ -72,7 +90,7 @@ pub fn apart(lost: &[bool], size: (usize, usize), radius: usize) -> Vec<bool> {
 /// `motions`: each frame's place, from the reference, centred pixels.
 pub fn masks(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3], channels: Channels) -> Vec<Plane> {
     let greys: Vec<Plane> = frames.iter().map(|f| grey(f, channels)).collect();
-    let clipped: Vec<Vec<bool>> = frames.iter().map(|f| clipped(f, channels)).collect();
+    let clipped: Vec<Vec<bool>> = frames.iter().map(|f| spoilt(f, channels)).collect();
     frames
         .iter()
         .enumerate()

@@ -4,9 +4,10 @@ use crate::channels;
 use crate::deblur::{self, Observation, Prior, Solution};
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
+use crate::ghosts;
 use crate::gpu::Gpu;
 use crate::image::{Channels, Plane, Rgb};
-use crate::kernels::{Kernels, UNSEEN};
+use crate::kernels::{Kernels, STILL, UNSEEN};
 use crate::mask;
 use crate::merge;
 use crate::noise::{self, NoiseModel};
@@ -60,6 +61,8 @@ pub struct Settings {
     pub noise: Option<NoiseModel>,
     /// What to do when no frame is sharp.
     pub blind: Blind,
+    /// Whether one sharp frame alone counts where sharp frames show something that moved between them ([`ghosts`]).
+    pub deghost: bool,
     /// Whether what displaced sharp frames show of structure finer than the pixels is looked for ([`deblur::aliasing`]).
     pub between_pixels: bool,
     /// The solver's settings.
@@ -81,6 +84,7 @@ impl Default for Settings {
             patch_size: None,
             noise: None,
             blind: Blind::default(),
+            deghost: true,
             between_pixels: true,
             deblur: deblur::Settings::default(),
         }
@@ -181,6 +185,8 @@ const SLIGHT: f64 = 4.0;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
 /// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
+/// Relative error of a merge that was resampled.
+const AT_THE_BORDER: f32 = 0.04;
 /// Outer iterations of the rounds before the last.
 const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
@@ -214,6 +220,8 @@ struct Run<'a> {
     settings: &'a Settings,
     exposures: Vec<Rgb>,
     masks: Vec<Plane>,
+    /// What part of its weight each sharp frame keeps where others show something else, on its own pixels; `None`: all of it.
+    ghosts: Vec<Option<Plane>>,
     /// What each frame's mask has been lessened to.
     shares: Vec<f32>,
     /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
@@ -289,6 +297,7 @@ pub fn merge_with(
         settings,
         exposures,
         masks: Vec::new(),
+        ghosts: vec![None; frames.len()],
         shares: vec![1.0; frames.len()],
         looks: Vec::new(),
         noise,
@@ -555,7 +564,7 @@ impl Run<'_> {
             self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
             verdicts
         };
-        self.memo.depends(&(self.settings.alpha, self.settings.blind, self.settings.deblur.interpolation));
+        self.memo.depends(&(self.settings.alpha, self.settings.deghost, self.settings.blind, self.settings.deblur.interpolation));
         let used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
         for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
             if let Some(tsf) = tsf {
@@ -647,6 +656,9 @@ impl Run<'_> {
             }
         } else if known.iter().all(|k| !k) {
             self.rebase(reference);
+        }
+        if !unexplained {
+            self.find_ghosts(&still)?;
         }
         self.weigh(&sharp, &used);
         if unexplained {
@@ -857,8 +869,11 @@ impl Run<'_> {
         to: f32,
     ) -> Result<Solution> {
         let (w, h) = self.bracket.size();
-        let observations: Vec<Observation> =
+        let mut observations: Vec<Observation> =
             ids.iter().map(|&i| self.observation(i, tsfs[i].clone().unwrap_or_else(Tsf::identity))).collect();
+        if pad == 0 {
+            observations.extend(self.at_the_border(ids, &observations));
+        }
         let moving = observations.iter().any(|o| !o.tsf.is_identity());
         let stage = if moving { "deblurring" } else { "merging the sharp frames" };
         self.progress(stage, from)?;
@@ -868,11 +883,47 @@ impl Run<'_> {
             events.borrow_mut()(Event::Estimate(estimate));
         };
         let mut hear = |f: f32| events.borrow_mut()(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f });
-        let solved = deblur::solve_watched(self.gpu, self.kernels, &observations, initial, pad, settings, &mut watch, &mut hear)?;
+        let mut solved = deblur::solve_watched(self.gpu, self.kernels, &observations, initial, pad, settings, &mut watch, &mut hear)?;
+        solved.misfit.truncate(ids.len());
+        solved.report.chi_squared.truncate(ids.len());
         if solved.report.memory.reduced {
             self.warn("the GPU's memory is short: the work is done in smaller pieces, which takes longer".into())?;
         }
         Ok(solved)
+    }
+
+    /// What displaced ones of the sharp frames `ids` (`observations`, in that order) show of the pixels next to the border of the latent grid, merged as they
+    /// lie, where no frame in place shows them: the warp of a frame that lies between them reaches beyond the border, so that it does not count there, and
+    /// what is left of it two pixels farther in, a hundredth of their light, would tell any nonsense of them.
+    fn at_the_border(&self, ids: &[usize], observations: &[Observation]) -> Option<Observation> {
+        let (w, h) = self.bracket.size();
+        let reach = STILL.support();
+        let (in_place, displaced): (Vec<usize>, Vec<usize>) =
+            (0..ids.len()).filter(|&k| observations[k].tsf.single().is_some()).partition(|&k| observations[k].tsf.is_identity());
+        let displaced: Vec<usize> = displaced.into_iter().map(|k| ids[k]).collect();
+        if displaced.is_empty() {
+            return None;
+        }
+        let (merged, _) = self.start(&displaced, 0);
+        let masks: Vec<&Plane> = in_place.into_iter().map(|k| &self.masks[ids[k]]).collect();
+        let lost = |p: usize| masks.iter().all(|m| m.data[p] == 0.0);
+        let edge = |a: usize, n: usize| a < reach || a + reach >= n;
+        let counts = |x: usize, y: usize| (edge(x, w) || edge(y, h)) && lost(y * w + x);
+        let mask = Plane::from_fn(w, h, |x, y| f32::from(counts(x, y)));
+        let brightest = (0..w * h).filter(|&p| mask.data[p] > 0.0).flat_map(|p| merged.pixel(p)).fold(0.0, f32::max);
+        if brightest <= 0.0 {
+            return None;
+        }
+        let steps = self.curves[ids[0]][0].len();
+        let noise = (0..steps).map(|k| AT_THE_BORDER * (k as f32 / (steps - 1) as f32).powi(2).max(1e-6)).collect::<Vec<_>>();
+        Some(Observation {
+            exposure: merged.map_planes(|p| p.map(|v| (v / brightest).min(1.0))),
+            mask,
+            exposure_time: 1.0 / f64::from(brightest),
+            noise: std::array::from_fn(|_| noise.clone()),
+            black_clipped: false,
+            tsf: Tsf::identity(),
+        })
     }
 
     /// Pixels by which the latent grid surrounds frames under `tsfs`.
@@ -883,14 +934,18 @@ impl Run<'_> {
 
     /// The mask by which frame `i` counts in the solver.
     fn counting(&self, i: usize) -> Plane {
-        mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], self.settings.alpha as f32, self.shares[i])
+        let (all, kept) = (self.shares[i], self.ghosts[i].as_ref());
+        let share = |p: usize| all * kept.map_or(1.0, |k| k.data[p]);
+        mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], self.settings.alpha as f32, share)
     }
 
     /// Frame `i`, every channel that is not clipped by itself.
     fn observation(&self, i: usize, tsf: Tsf) -> Observation {
         let frame = &self.bracket.frames()[i];
-        let unclipped = |x: f32, z: f32| if z < mask::CLIPPED { x } else { UNSEEN };
-        let mut exposure = Rgb(std::array::from_fn(|c| self.exposures[i].0[c].zip(&frame.intensity.0[c], unclipped)));
+        let mut exposure = self.exposures[i].clone();
+        for (plane, clipped) in exposure.0.iter_mut().zip(mask::spoilt_channels(frame)) {
+            plane.data.iter_mut().zip(clipped).filter(|(_, clipped)| *clipped).for_each(|(e, _)| *e = UNSEEN);
+        }
         if let Some(finer) = &self.aliasing[i] {
             for (e, f) in exposure.0.iter_mut().zip(&finer.0) {
                 *e = e.zip(f, |e, f| if e == UNSEEN { e } else { e - f });
@@ -904,6 +959,22 @@ impl Run<'_> {
             black_clipped: true,
             tsf,
         }
+    }
+
+    /// Where the sharp frames `still` do not show the same scene, and which of them counts there.
+    fn find_ghosts(&mut self, still: &[usize]) -> Result<()> {
+        if !self.settings.deghost || still.len() < 2 {
+            return Ok(());
+        }
+        let bytes = |found: &Vec<Option<Plane>>| found.iter().flatten().map(|f| 4 * f.data.len()).sum();
+        let found = self.remembered("ghosts", &format!("{still:?}"), bytes, |run| {
+            let Run { exposures, curves, noise, motions, .. } = &*run;
+            Ok(ghosts::Sharp { frames: run.bracket.frames(), exposures, curves, noise, motions, ids: still }.shares())
+        })?;
+        for (&i, share) in still.iter().zip(found) {
+            self.ghosts[i] = share;
+        }
+        Ok(())
     }
 
     /// What the displaced ones of the sharp frames `still` show of structure finer than the latent grid, unless that is known. `latent`: irradiance as it
@@ -1064,6 +1135,13 @@ impl Run<'_> {
         };
         self.looks = (0..sharp.len()).map(look).collect();
         self.masks = masks(Channels::ALL);
+        // Of a frame that turned out to be shaken nothing of the kind is known.
+        self.ghosts.iter_mut().zip(sharp).for_each(|(ghost, sharp)| *ghost = ghost.take().filter(|_| *sharp));
+        for (mask, kept) in self.masks.iter_mut().zip(&self.ghosts) {
+            if let Some(kept) = kept {
+                *mask = mask.zip(kept, |m, k| m * k);
+            }
+        }
     }
 
     /// Luminances, the mean of the channels in which the blur of frame `i` is looked for, of the irradiance `latent` and of what the frame at
@@ -1216,6 +1294,7 @@ impl Run<'_> {
                     "triage": verdicts[i],
                     "registration": self.registrations[i],
                     "chi_squared": position.map(|p| solution.report.chi_squared[p]),
+                    "ghosts": self.ghosts[i].as_ref().map(|g| 1.0 - g.data.iter().map(|v| f64::from(*v)).sum::<f64>() / g.data.len() as f64),
                     "aliasing_rms": self.aliasing[i].as_ref().map(root_mean_square),
                     "blur": details[i],
                     "tsf": tsfs[i].as_ref().map(|t| TsfEntry::new(&frames[i].name, w, h, t)),

@@ -90,6 +90,9 @@ pub(super) struct MergeArgs {
     /// Take the frames as they lie, without registering them against each other
     #[arg(long)]
     pub no_align: bool,
+    /// Let all sharp frames count where something moved between them, instead of the one that shows it best
+    #[arg(long)]
+    pub keep_ghosts: bool,
     /// Exit with code 3 when a frame was left out or nothing could be deblurred (what there is is written all the same)
     #[arg(long)]
     pub strict: bool,

@@ -375,6 +375,7 @@ impl PhotoSettings {
             ("--layers".into(), set(args.photo.layers)),
             ("--tonemap".into(), self.operator.to_string()),
             ("--no-align".into(), set(args.no_align)),
+            ("--keep-ghosts".into(), set(args.keep_ghosts)),
             ("--noise".into(), or(&args.noise, "as the files note it, else estimated")),
             ("--strict".into(), set(args.strict)),
             ("--prior".into(), args.prior.clone()),
@@ -428,7 +429,7 @@ pub(super) fn blind(word: Option<&str>) -> Result<Blind, Usage> {
 
 fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     let n = args.frames.len();
-    let mut settings = Settings { align: !args.no_align, ..Settings::default() };
+    let mut settings = Settings { align: !args.no_align, deghost: !args.keep_ghosts, ..Settings::default() };
     if let Some(word) = &args.reference {
         settings.reference = Some(frame_number("--reference", word, n)?);
     }

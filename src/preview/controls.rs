@@ -219,6 +219,8 @@ fn parameters(app: &mut App, ui: &mut egui::Ui) {
             }
         });
     ui.checkbox(&mut p.align, "Register the frames");
+    ui.checkbox(&mut p.deghost, "Remove ghosts")
+        .on_hover_text("Where something moved between sharp frames, the one that shows it best counts alone");
     ui.horizontal(|ui| {
         let label = ui.label("Response");
         let edit = egui::TextEdit::singleline(&mut app.typed_response).desired_width(120.0).hint_text("as the files say");

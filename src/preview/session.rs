@@ -61,6 +61,8 @@ pub struct Parameters {
     pub psf_radius: usize,
     /// Whether frames are registered (`--no-align` otherwise).
     pub align: bool,
+    /// Whether ghosts are removed (`--keep-ghosts` otherwise).
+    pub deghost: bool,
     /// `--blind`.
     pub blind: String,
     /// `--response`; empty: as `merge` finds it.
@@ -84,6 +86,7 @@ impl Default for Parameters {
             model: merge.model.name().into(),
             psf_radius: 0,
             align: merge.align,
+            deghost: merge.deghost,
             blind: "auto".into(),
             response: String::new(),
             reference: None,
@@ -192,6 +195,9 @@ impl Session {
         }
         if !p.align {
             all.push(("no-align", None));
+        }
+        if !p.deghost {
+            all.push(("keep-ghosts", None));
         }
         let mut differs = |name, value: String, usual: String| {
             if value != usual {

@@ -1,11 +1,12 @@
 //! What the engine says in the words of the command line, in those of the window.
 
 /// Options of `merge`, and what sets them in the window.
-pub const CONTROLS: [(&str, &str); 16] = [
+pub const CONTROLS: [(&str, &str); 17] = [
     ("--exposures", "the times below the thumbnails"),
     ("--exclude", "what is left out"),
     ("--sharp", "\"sharp\" below the thumbnails"),
     ("--no-align", "\"Register the frames\" switched off"),
+    ("--keep-ghosts", "\"Remove ghosts\" switched off"),
     ("--blind", "\"No frame sharp\""),
     ("--scale", "\"Size\""),
     ("--memory-limit", "\"GPU memory\""),

@@ -27,6 +27,8 @@ mod display;
 /// The paper's experiments, tiny.
 mod experiments;
 mod faults;
+/// What moved between sharp frames.
+mod ghosts;
 /// Files: frames, exposure times, OpenEXR, outputs.
 mod io;
 /// Every other kernel against its oracle.

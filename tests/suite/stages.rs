@@ -167,11 +167,30 @@ fn what_is_clipped_in_some_channels_counts_by_the_grey_of_all() {
     let intensity = Rgb([0, 1, 2].map(|c| Plane { width: pixels.len(), height: 1, data: pixels.iter().map(|p| p[c]).collect() }));
     let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, exposure_time: 1.0 };
     let mask = Plane { width: pixels.len(), height: 1, data: vec![0.8, 0.0, 0.0, 0.0, 0.0, 0.0] };
-    let found = mask::with_partly_clipped(&mask, &frame, 0.3, 0.5).data;
+    let found = mask::with_partly_clipped(&mask, &frame, 0.3, |_| 0.5).data;
     // Greys of 0.65, 0.943 and 0.903: the first in the flat part of the window, the others 0.057 and 0.097 from its end.
     let taper = |z: f32| 0.5 * 0.5 * (1.0 - (2.0 * std::f32::consts::PI * z / 0.3).cos());
     for (got, expected) in found.iter().zip([0.8, 0.5, taper(0.057), 0.0, 0.0, taper(0.097)]) {
         assert!((got - expected).abs() < 1e-3, "{found:?}");
+    }
+}
+
+/// Colour that is stored for squares of four and interpolated reaches two pixels far.
+#[test]
+fn subsampled_colour_is_spoilt_beside_clipped_pixels() {
+    let (w, h) = (9, 8);
+    let lamp = Plane::from_fn(w, h, |x, y| if (x, y) == (3, 1) { 1.0 } else { 0.4 });
+    let intensity = Rgb([lamp, Plane::filled(w, h, 0.4), Plane::filled(w, h, 0.4)]);
+    let frame =
+        |chroma_subsampled| Frame { name: "one".into(), intensity: intensity.clone(), levels: 255, chroma_subsampled, exposure_time: 1.0 };
+    for (subsampled, reach) in [(false, 0), (true, 2)] {
+        let found = mask::spoilt_channels(&frame(subsampled));
+        for (p, red) in found[0].iter().enumerate() {
+            assert_eq!(*red, (p % w).abs_diff(3).max((p / w).abs_diff(1)) <= reach, "{subsampled}: {} {}", p % w, p / w);
+        }
+        assert!(found[1..].iter().flatten().all(|c| !c));
+        assert_eq!(found[0], mask::spoilt(&frame(subsampled), Channels::ALL));
+        assert_eq!(mask::clipped(&frame(subsampled), Channels::ALL).iter().filter(|c| **c).count(), 1);
     }
 }
 

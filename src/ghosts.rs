@@ -1,0 +1,283 @@
+//! Ghosts: where sharp frames do not show the same scene because something in it moved. One of them then counts alone. No irradiance, no solver.
+//!
+//! Exposures of the same scene may differ by what nobody knows of a camera's tone curve, and do in every JPEG; its structure does not. So two frames are
+//! compared over small squares, by what is left of the contrast of one that the other, times a factor near 1, does not explain.
+
+use crate::exposure::Frame;
+use crate::image::{Plane, Rgb};
+use crate::mask;
+use crate::noise::{self, NoiseModel};
+use crate::pose::project;
+use glam::{DMat3, DVec2};
+
+/// Squares of the frame of so many pixels a side are one where frames are compared, or more for frames of more than [`MOST`] of them: what moved is larger, and
+/// what pixels alias is not.
+const LEAST_SIDE: usize = 2;
+/// Pixels of the frame below which its pixels themselves are compared.
+const SMALL: usize = 64;
+const MOST: usize = 4_000_000;
+/// Radius, in squares, over which they are smoothed: what pixels alias, and what is interpolated between them, is finer.
+const SMOOTH: usize = 1;
+/// Radius, in squares, of the surroundings that contrast is looked at in; and the part of them that has to be seen by both frames.
+const AROUND: usize = 2;
+const SEEN: f32 = 0.3;
+/// Radius in squares over which it is decided which frame counts.
+const REGION: usize = 8;
+/// Steps of a file's values that its exposures are not believed, beside their noise: JPEG files drop what is finer.
+const STEPS: f32 = 2.0;
+/// Relative variance of an exposure from which it tells nothing.
+const UNKNOWN: f32 = 0.12;
+/// Contrast (of ln E) that may always be left, and the part of the contrast that there is and of the noise.
+const CONTRAST: f32 = 0.06;
+const OF_CONTRAST: f32 = 0.4;
+const OF_NOISE: f32 = 0.5;
+/// By what tone curves differ, as the exponent of one irradiance in the other.
+const EXPONENT: (f32, f32) = (0.67, 1.5);
+/// Part of what is too much from which a ghost goes on around where it is too much, difference of ln E likewise, and how many squares of too much begin one.
+const GOES_ON: f32 = 0.4;
+const DIFFERENT: f32 = 0.35;
+const FEWEST: usize = 8;
+/// Ghosts of less than one in so many squares are each shown by one frame; larger ones, a sea, may need another one here and there.
+const SMALL_THING: usize = 10;
+/// Squares by which a ghost is widened, and over which it fades.
+const WIDER: usize = 3;
+const FADES: usize = 2;
+
+/// What is known of the frames that are compared.
+pub struct Sharp<'a> {
+    /// All frames of the bracket.
+    pub frames: &'a [Frame],
+    /// Their exposures f⁻¹(Z), 1 = white.
+    pub exposures: &'a [Rgb],
+    /// Their noise, as [`noise::curves`] has it, and without what rounding adds.
+    pub curves: &'a [[Vec<f32>; 3]],
+    /// Likewise.
+    pub noise: &'a NoiseModel,
+    /// Each frame's place, from the reference, centred pixels.
+    pub motions: &'a [DMat3],
+    /// The sharp ones.
+    pub ids: &'a [usize],
+}
+
+/// A frame on the reference's grid, squares of pixels.
+struct Shown {
+    /// ln E, NaN where it is clipped, too dark to tell, or not seen.
+    log: Rgb,
+    /// Relative variance of E.
+    variance: Rgb,
+    /// How little it is worth around a square: what of it is clipped, and its relative variance; infinite where it is not seen.
+    cost: Plane,
+    clipped: Plane,
+}
+
+/// Squares of `side` pixels of frames of `size`.
+#[derive(Clone, Copy)]
+struct Grid {
+    size: (usize, usize),
+    side: usize,
+}
+
+impl Grid {
+    fn of(size: (usize, usize)) -> Self {
+        let mut side = if size.0.min(size.1) < SMALL { 1 } else { LEAST_SIDE };
+        while (size.0 / side) * (size.1 / side) > MOST {
+            side += 1;
+        }
+        Self { size, side }
+    }
+
+    fn squares(self) -> (usize, usize) {
+        (self.size.0 / self.side, self.size.1 / self.side)
+    }
+
+    /// From the first pixel to the frame's middle.
+    fn middle(self) -> DVec2 {
+        0.5 * DVec2::new(self.size.0 as f64 - 1.0, self.size.1 as f64 - 1.0)
+    }
+
+    /// Squares, from the first one, of a place in centred pixels.
+    fn at(self, place: DVec2) -> DVec2 {
+        (place + self.middle() - 0.5 * (self.side as f64 - 1.0)) / self.side as f64
+    }
+}
+
+/// `plane` at (x, y) between its squares; NaN if one of them is.
+fn between(plane: &Plane, at: DVec2) -> f32 {
+    let (fx, fy) = (at.x.floor(), at.y.floor());
+    let (u, v) = ((at.x - fx) as f32, (at.y - fy) as f32);
+    let p = |a: isize, b: isize| plane.clamped(fx as isize + a, fy as isize + b);
+    (1.0 - v) * ((1.0 - u) * p(0, 0) + u * p(1, 0)) + v * ((1.0 - u) * p(0, 1) + u * p(1, 1))
+}
+
+/// Mean over squares around.
+fn around(plane: &Plane, r: usize) -> Plane {
+    let count = |a: usize, n: usize| ((a + r).min(n - 1) + 1 - a.saturating_sub(r)) as f32;
+    let (w, h) = plane.size();
+    let sum = plane.box_sum(r);
+    Plane::from_fn(w, h, |x, y| sum.at(x, y) / (count(x, w) * count(y, h)))
+}
+
+impl Sharp<'_> {
+    /// Frame `i` where the reference sees it.
+    fn shown(&self, i: usize, grid: Grid) -> Shown {
+        let (frame, motion) = (&self.frames[i], &self.motions[i]);
+        let (w, h) = grid.squares();
+        // A plane of which `f` says what it is at a place of the frame, pixels from the first one: means over squares.
+        let means = |f: &(dyn Fn(DVec2) -> f32 + Sync)| {
+            let pixels = grid.side * grid.side;
+            let at = |x: usize, y: usize, k: usize| {
+                let pixel = DVec2::new((x * grid.side + k % grid.side) as f64, (y * grid.side + k / grid.side) as f64);
+                f(if *motion == DMat3::IDENTITY { pixel } else { project(motion, pixel - grid.middle()) + grid.middle() })
+            };
+            Plane::from_fn(w, h, |x, y| (0..pixels).map(|k| at(x, y, k)).sum::<f32>() / pixels as f32)
+        };
+        let last = DVec2::new(grid.size.0 as f64 - 1.0, grid.size.1 as f64 - 1.0);
+        let outside = means(&|at| f32::from(at.min_element() < 0.0 || at.x > last.x || at.y > last.y));
+        let smooth = |c: usize| around(&means(&|at| between(&self.exposures[i].0[c], at)), SMOOTH);
+        let exposure: [Plane; 3] = std::array::from_fn(smooth);
+        let burnt: [Plane; 3] = mask::spoilt_channels(frame).map(|clipped| {
+            let clipped = Plane::from_fn(grid.size.0, grid.size.1, |x, y| f32::from(clipped[y * grid.size.0 + x]));
+            // As whole numbers, which sums keep as they are.
+            means(&|at| between(&clipped, at)).map(f32::ceil).box_sum(SMOOTH)
+        });
+        let averaged = ((2 * SMOOTH + 1) * grid.side).pow(2) as f32;
+        let relative = |c: usize, x: f32| {
+            let (all, captured) = (noise::at(&self.curves[i][c], x).powi(2), self.noise.variance(f64::from(x)) as f32);
+            // Rounding makes a twelfth of a step's square.
+            let rounding = 12.0 * (all - captured).max(0.0) * STEPS * STEPS;
+            (captured / averaged + rounding) / (x * x).max(f32::MIN_POSITIVE)
+        };
+        let variance = Rgb(std::array::from_fn(|c| exposure[c].map(|x| relative(c, x))));
+        let time = frame.exposure_time as f32;
+        let log = |c: usize| {
+            let tells = |x: usize, y: usize| burnt[c].at(x, y) <= 0.0 && variance.0[c].at(x, y) <= UNKNOWN && outside.at(x, y) <= 0.0;
+            Plane::from_fn(w, h, |x, y| if tells(x, y) { (exposure[c].at(x, y) / time).ln() } else { f32::NAN })
+        };
+        let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
+        let noisy = variance.map_planes(|p| p.map(|v| v.min(1.0))).mean();
+        let cost = around(&clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }), REGION);
+        let cost = cost.zip(&outside, |c, o| if o > 0.0 { f32::INFINITY } else { c });
+        Shown { log: Rgb(std::array::from_fn(log)), variance, cost, clipped }
+    }
+
+    /// Part of its weight that each of the sharp frames keeps at each of its pixels, 0..=1; `None` for one that keeps all of it.
+    pub fn shares(&self) -> Vec<Option<Plane>> {
+        let grid = Grid::of(self.frames[self.ids[0]].intensity.size());
+        let shown: Vec<Shown> = self.ids.iter().map(|&i| self.shown(i, grid)).collect();
+        let (w, h) = grid.squares();
+        let cheapest = |pixels: &[usize]| {
+            let cost = |k: usize| pixels.iter().map(|&p| f64::from(shown[k].cost.data[p])).sum::<f64>();
+            (0..shown.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b))).unwrap_or(0)
+        };
+        let mut keeper: Vec<usize> = (0..w * h).map(|p| cheapest(&[p])).collect();
+        let ghosts = |keeper: &[usize]| -> Vec<Option<Plane>> {
+            let of = |plane: &(dyn Fn(&Shown) -> &Plane + Sync)| Plane::from_fn(w, h, |x, y| plane(&shown[keeper[y * w + x]]).at(x, y));
+            let log = Rgb(std::array::from_fn(|c| of(&move |s| &s.log.0[c])));
+            let variance = Rgb(std::array::from_fn(|c| of(&move |s| &s.variance.0[c])));
+            (0..shown.len()).map(|k| shown[k].ghost(&log, &variance, |p| keeper[p] != k)).collect()
+        };
+        let mut found = ghosts(&keeper);
+        // Who walks by is shown by one frame from head to foot.
+        let any: Vec<bool> = (0..w * h).map(|p| found.iter().flatten().any(|g| g.data[p] > 0.0)).collect();
+        let mut looked = vec![false; w * h];
+        for p in 0..w * h {
+            if any[p] && !looked[p] {
+                let whole = connected(&any, (w, h), p, &mut looked);
+                if whole.len() < w * h / SMALL_THING {
+                    let one = cheapest(&whole);
+                    whole.into_iter().for_each(|q| keeper[q] = one);
+                }
+            }
+        }
+        if any.contains(&true) {
+            found = ghosts(&keeper);
+        }
+        let clipped = Plane::from_fn(w, h, |x, y| shown[keeper[y * w + x]].clipped.at(x, y));
+        let own = |k: usize| {
+            let ghost = around(found[k].as_ref()?, FADES);
+            // Where the frame that counts is clipped, any other tells more.
+            let gone = Plane::from_fn(w, h, |x, y| if keeper[y * w + x] == k || clipped.at(x, y) > 0.0 { 0.0 } else { ghost.at(x, y) });
+            let back = self.motions[self.ids[k]].inverse();
+            let (w, h) = grid.size;
+            Some(Plane::from_fn(w, h, |x, y| {
+                let place = DVec2::new(x as f64, y as f64) - grid.middle();
+                1.0 - between(&gone, grid.at(project(&back, place)))
+            }))
+        };
+        (0..shown.len()).map(own).collect()
+    }
+}
+
+impl Shown {
+    /// 1 where this frame and what `log` and `variance` tell of another do not show the same, of the squares that are `asked` for; `None` if nowhere.
+    fn ghost(&self, log: &Rgb, variance: &Rgb, asked: impl Fn(usize) -> bool + Sync) -> Option<Plane> {
+        let (w, h) = log.size();
+        // By how much there is too much left, and the same of the difference: 1 is too much.
+        let mut left = Plane::filled(w, h, 0.0);
+        let mut level = Plane::filled(w, h, 0.0);
+        for c in 0..3 {
+            let (a, b) = (&log.0[c], &self.log.0[c]);
+            let counts = Plane::from_fn(w, h, |x, y| f32::from(asked(y * w + x) && a.at(x, y).is_finite() && b.at(x, y).is_finite()));
+            let seen = around(&counts, AROUND);
+            // Of differences from one value in the middle: f32 holds their squares.
+            let values = || counts.data.iter().zip(&a.data).filter(|(n, _)| **n > 0.0).map(|(_, v)| f64::from(*v));
+            let middle = (values().sum::<f64>() / values().count().max(1) as f64) as f32;
+            let mean = |f: &(dyn Fn(usize) -> f32 + Sync)| {
+                let at = |x: usize, y: usize| if counts.at(x, y) > 0.0 { f(y * w + x) } else { 0.0 };
+                around(&Plane::from_fn(w, h, at), AROUND).zip(&seen, |sum, n| sum / n.max(1e-6))
+            };
+            let (va, vb) = (|p: usize| a.data[p] - middle, |p: usize| b.data[p] - middle);
+            let (ma, mb) = (mean(&va), mean(&vb));
+            let (aa, bb, ab) = (mean(&|p| va(p) * va(p)), mean(&|p| vb(p) * vb(p)), mean(&|p| va(p) * vb(p)));
+            let noise = mean(&|p| variance.0[c].data[p] + self.variance.0[c].data[p]);
+            let found = |x: usize, y: usize| {
+                if seen.at(x, y) < SEEN {
+                    return [0.0; 2];
+                }
+                let (ma, mb, noise) = (ma.at(x, y), mb.at(x, y), noise.at(x, y));
+                let (aa, bb, ab) = ((aa.at(x, y) - ma * ma).max(0.0), (bb.at(x, y) - mb * mb).max(0.0), ab.at(x, y) - ma * mb);
+                let k = (ab / aa.max(1e-9)).clamp(EXPONENT.0, EXPONENT.1);
+                let rest = bb - 2.0 * k * ab + k * k * aa - noise;
+                let much = CONTRAST * CONTRAST + OF_NOISE * noise + OF_CONTRAST * aa.max(bb);
+                [rest / much, (ma - mb).abs() / (DIFFERENT + 2.0 * noise.sqrt())]
+            };
+            left = Plane::from_fn(w, h, |x, y| found(x, y)[0].max(left.at(x, y)));
+            level = Plane::from_fn(w, h, |x, y| found(x, y)[1].max(level.at(x, y)));
+        }
+        let part: Vec<bool> = left.data.iter().zip(&level.data).map(|(s, d)| *s > GOES_ON || *d > 1.0).collect();
+        let mut ghost = Plane::filled(w, h, 0.0);
+        let mut found = false;
+        let mut looked = vec![false; w * h];
+        for p in 0..w * h {
+            if looked[p] || !part[p] {
+                continue;
+            }
+            let whole = connected(&part, (w, h), p, &mut looked);
+            if whole.iter().filter(|&&q| left.data[q] > 1.0).count() >= FEWEST {
+                found = true;
+                whole.iter().for_each(|&q| ghost.data[q] = 1.0);
+            }
+        }
+        found.then(|| ghost.box_sum(WIDER).map(|n| f32::from(n > 0.5)))
+    }
+}
+
+/// The pixels of `part` that hang together with `from`, by rows and columns; they are marked as `looked` at.
+fn connected(part: &[bool], size: (usize, usize), from: usize, looked: &mut [bool]) -> Vec<usize> {
+    let (w, h) = size;
+    let mut all = vec![from];
+    looked[from] = true;
+    let mut next = 0;
+    while let Some(&p) = all.get(next) {
+        next += 1;
+        let (x, y) = (p % w, p / w);
+        let neighbours = [(x > 0).then(|| p - 1), (x + 1 < w).then(|| p + 1), (y > 0).then(|| p - w), (y + 1 < h).then(|| p + w)];
+        for q in neighbours.into_iter().flatten() {
+            if part[q] && !looked[q] {
+                looked[q] = true;
+                all.push(q);
+            }
+        }
+    }
+    all
+}
