@@ -23,6 +23,8 @@ const AROUND: usize = 2;
 const SEEN: f32 = 0.3;
 /// Radius in squares over which it is decided which frame counts.
 const REGION: usize = 8;
+/// What a place that a frame does not see costs it; one that it clips costs 1.
+const NOT_SEEN: f32 = 2.0;
 /// Steps of a file's values that its exposures are not believed, beside their noise: JPEG files drop what is finer.
 const STEPS: f32 = 2.0;
 /// Relative variance of an exposure from which it tells nothing.
@@ -65,7 +67,7 @@ struct Shown {
     log: Rgb,
     /// Relative variance of E.
     variance: Rgb,
-    /// How little it is worth around a square: what of it is clipped, and its relative variance; infinite where it is not seen.
+    /// How little it is worth around a square: what of it is clipped, and its relative variance.
     cost: Plane,
     clipped: Plane,
 }
@@ -156,7 +158,7 @@ impl Sharp<'_> {
         let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
         let noisy = variance.map_planes(|p| p.map(|v| v.min(1.0))).mean();
         let cost = around(&clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }), REGION);
-        let cost = cost.zip(&outside, |c, o| if o > 0.0 { f32::INFINITY } else { c });
+        let cost = cost.zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
         Shown { log: Rgb(std::array::from_fn(log)), variance, cost, clipped }
     }
 

@@ -25,12 +25,63 @@ const MARGIN: usize = 16;
 /// What is found counts as noise up to so many of the frame's standard deviations, in squares of side 2 r + 1 around a pixel for this r.
 const NOISE: f32 = 0.4;
 const AROUND: usize = 2;
-/// One in so many pixels of displaced frames is kept from the solution, to tell whether what is found is there.
-const KEPT_BACK: u64 = 8;
-/// Those in squares of side 2 r + 1 around a pixel decide, for this r.
-const WITNESSES: usize = 24;
-/// Part of what was found that they have to confirm for all of it to be believed: between the pixels that were solved for it is less sure than at them.
-const ENOUGH: f32 = 0.3;
+/// Side in pixels of the squares over which it is looked at what sharp frames differ by where nothing is finer than the pixels, and how many pixels (of one in
+/// four) have to tell.
+const SQUARE: usize = 32;
+const FEWEST: usize = 64;
+/// Those pixels: the quantile of the squared difference over noise variance, mean of three channels, and what noise alone makes of it.
+const QUIETEST: f64 = 0.25;
+const OF_NOISE: f32 = 0.404;
+
+/// A sharp frame, its place from the latent grid (centred pixels), and by how much less than its noise says it is believed at a pixel, 0..=1.
+struct Sharp<'a> {
+    frame: &'a Observation,
+    motion: DMat3,
+    trust: Plane,
+}
+
+impl<'a> Sharp<'a> {
+    /// `None` for a shaken frame. `start`: irradiance on the frames' grid plus so many pixels. What nobody knows of a tone curve, and noise that a file
+    /// format has made smooth, would otherwise be taken for structure between the pixels, which explains any difference.
+    fn of(frame: &'a Observation, start: (&Rgb, usize)) -> Option<Self> {
+        let motion = frame.tsf.single()?;
+        let (w, h) = frame.mask.size();
+        let back = Projection::new(motion.inverse());
+        let middle = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
+        let off = |x: usize, y: usize| -> Option<f32> {
+            let p = y * w + x;
+            if frame.mask.data[p] <= 0.0 || frame.exposure.0.iter().any(|e| e.data[p] < 0.0) {
+                return None;
+            }
+            let seen = sample(start.0, STILL, back.of(DVec2::new(x as f64, y as f64) - middle) + middle + DVec2::splat(start.1 as f64));
+            let mut sum = 0.0;
+            for (c, seen) in seen.iter().enumerate() {
+                let (exposure, last) = (frame.exposure.0[c].data[p], (frame.noise[c].len() - 1) as f32);
+                let noise = frame.noise[c][(exposure.min(1.0).sqrt() * last) as usize];
+                sum += ((exposure - (seen * frame.exposure_time) as f32) / noise).powi(2) / 3.0;
+            }
+            Some(sum)
+        };
+        let trusted = |k: usize| {
+            let (x, y) = (k % w.div_ceil(SQUARE) * SQUARE, k / w.div_ceil(SQUARE) * SQUARE);
+            let pixels = (y..(y + SQUARE).min(h)).step_by(2).flat_map(|j| (x..(x + SQUARE).min(w)).step_by(2).map(move |i| (i, j)));
+            let mut found: Vec<f32> = pixels.filter_map(|(i, j)| off(i, j)).collect();
+            if found.len() < FEWEST {
+                return 1.0;
+            }
+            let at = (QUIETEST * found.len() as f64) as usize;
+            let quiet = *found.select_nth_unstable_by(at, f32::total_cmp).1;
+            (OF_NOISE / quiet.max(OF_NOISE)).sqrt()
+        };
+        let (across, down) = (w.div_ceil(SQUARE), h.div_ceil(SQUARE));
+        let data: Vec<f32> = (0..across * down).into_par_iter().map(trusted).collect();
+        let squares = Rgb([(); 3].map(|()| Plane { width: across, height: down, data: data.clone() }));
+        // Between the squares' middles: a step would show.
+        let middle = |a: usize| (a as f64 + 0.5) / SQUARE as f64 - 0.5;
+        let trust = Plane::from_fn(w, h, |x, y| sample(&squares, Interpolation::Bilinear, DVec2::new(middle(x), middle(y)))[0] as f32);
+        Some(Self { frame, motion, trust })
+    }
+}
 
 /// A part of the latent grid, and the same part of a frame as nearly as whole pixels go.
 struct Window {
@@ -138,26 +189,21 @@ impl Fine {
     fn solve(
         gpu: &Gpu,
         kernels: &Kernels,
-        sharp: &[(&Observation, DMat3)],
+        sharp: &[Sharp],
         window: Window,
         start: (&Rgb, usize),
         settings: &Settings,
         progress: &mut dyn FnMut(f32) -> bool,
     ) -> Result<Self> {
-        let own: Vec<(DVec2, DMat3)> = sharp.iter().map(|(_, m)| (window.shift(m), window.motion(m))).collect();
+        let own: Vec<(DVec2, DMat3)> = sharp.iter().map(|s| (window.shift(&s.motion), window.motion(&s.motion))).collect();
         let still: Vec<Tsf> = own.iter().map(|(_, m)| Tsf::still(*m)).collect();
         let pad = pad_for(&still.iter().collect::<Vec<_>>(), window.size.0, window.size.1, MARGIN);
         let twice = |p: &Plane, f: fn(&Plane, usize, usize) -> f32| Plane::from_fn(2 * p.width, 2 * p.height, |x, y| f(p, x, y));
-        let counting = |o: &Observation, shift: DVec2| {
-            let mask = window.cut(&o.mask, shift, 0, Some(0.0));
-            let on_frame = |a: usize, first: usize, by: f64| ((a + first) as isize + by as isize) as usize;
-            let counts =
-                |x, y| o.tsf.is_identity() || !kept_back(on_frame(x, window.corner.0, shift.x), on_frame(y, window.corner.1, shift.y));
-            Plane::from_fn(mask.width, mask.height, |x, y| if counts(x, y) { mask.at(x, y) } else { 0.0 })
-        };
-        let seen = |((o, _), (shift, motion)): (&(&Observation, DMat3), &(DVec2, DMat3))| Observation {
+        let seen = |(Sharp { frame: o, trust, .. }, (shift, motion)): (&Sharp, &(DVec2, DMat3))| Observation {
             exposure: o.exposure.map_planes(|p| twice(&window.cut(p, *shift, 0, None), |p, x, y| p.at(x / 2, y / 2))),
-            mask: twice(&counting(o, *shift), |p, x, y| if (x | y).is_multiple_of(2) { p.at(x / 2, y / 2) } else { 0.0 }),
+            mask: twice(&window.cut(&o.mask, *shift, 0, Some(0.0)).zip(&window.cut(trust, *shift, 0, None), |m, t| m * t), |p, x, y| {
+                if (x | y).is_multiple_of(2) { p.at(x / 2, y / 2) } else { 0.0 }
+            }),
             exposure_time: o.exposure_time,
             noise: o.noise.clone(),
             black_clipped: o.black_clipped,
@@ -170,22 +216,21 @@ impl Fine {
         Ok(Self { window, pad, irradiance, means })
     }
 
-    /// What the pixel at `q` of a frame shows of the irradiance, and what K makes of its means; `back`: from there to the latent grid, both centred on the
+    /// What the pixel at `q` of a frame shows of the irradiance less what K makes of its means; `back`: from there to the latent grid, both centred on the
     /// window.
-    fn shown(&self, back: &Projection, q: DVec2) -> ([f64; 3], [f64; 3]) {
+    fn difference(&self, back: &Projection, q: DVec2) -> [f64; 3] {
         let middle = self.window.half() + DVec2::splat(self.pad as f64);
-        let mut finer = [0.0; 3];
+        let mut out = sample(&self.means, STILL, back.of(q) + middle).map(|v| -v);
         for (x, y) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
             let at = back.of(q + DVec2::new(x, y)) + middle;
             let seen = sample(&self.irradiance, Interpolation::Bilinear, 2.0 * at + DVec2::splat(0.5));
-            finer.iter_mut().zip(seen).for_each(|(o, v)| *o += 0.25 * v);
+            out.iter_mut().zip(seen).for_each(|(o, v)| *o += 0.25 * v);
         }
-        (finer, sample(&self.means, STILL, back.of(q) + middle))
+        out
     }
 
-    /// Writes into `out` what a `frame` at `motion` shows of the square of side `tile` whose first pixel is `core`, and into `told` what its pixels that
-    /// were kept back say of that.
-    fn write(&self, frame: &Observation, motion: &DMat3, core: (usize, usize), tile: usize, out: &mut Rgb, told: &mut Told) {
+    /// Writes into `out` what a frame at `motion` with that exposure time shows of the square of side `tile` whose first pixel is `core`.
+    fn write(&self, motion: &DMat3, exposure_time: f64, core: (usize, usize), tile: usize, out: &mut Rgb) {
         let (shift, back) = (self.window.shift(motion), Projection::new(self.window.motion(motion).inverse()));
         let (w, h) = out.size();
         let first = DVec2::new(core.0 as f64, core.1 as f64) - 0.5;
@@ -197,65 +242,13 @@ impl Fine {
             let there = back.of(q) + self.window.half() + corner - first;
             let seen = on_frame.min_element() >= 0.0 && on_frame.x < w as f64 && on_frame.y < h as f64;
             let inside = there.min_element() >= 0.0 && there.max_element() < tile as f64;
-            (seen && inside).then(|| {
-                let at = on_frame.y as usize * w + on_frame.x as usize;
-                let (finer, coarse) = self.shown(&back, q);
-                let light = |v: [f64; 3]| v.map(|v| (v * frame.exposure_time) as f32);
-                let found = light(std::array::from_fn(|c| finer[c] - coarse[c]));
-                let said = kept_back(on_frame.x as usize, on_frame.y as usize).then(|| frame.says(at, light(coarse), found));
-                (at, found, said.unwrap_or_default())
-            })
+            let at = || on_frame.y as usize * w + on_frame.x as usize;
+            (seen && inside).then(|| (at(), self.difference(&back, q).map(|v| (v * exposure_time) as f32)))
         };
-        let found: Vec<(usize, [f32; 3], [f32; 2])> =
-            (0..self.window.size.0 * self.window.size.1).into_par_iter().filter_map(one).collect();
-        for (at, values, said) in found {
+        let found: Vec<(usize, [f32; 3])> = (0..self.window.size.0 * self.window.size.1).into_par_iter().filter_map(one).collect();
+        for (at, values) in found {
             out.0.iter_mut().zip(values).for_each(|(p, v)| p.data[at] = v);
-            (told.agreement.data[at], told.power.data[at]) = (said[0], said[1]);
         }
-    }
-}
-
-/// Whether a pixel of a displaced frame is kept from the solution.
-fn kept_back(x: usize, y: usize) -> bool {
-    let mixed = (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
-    (mixed ^ (mixed >> 29)).wrapping_mul(0x1656_67b1_9e37_79f9) >> 32 & (KEPT_BACK - 1) == 0
-}
-
-/// What the pixels that were kept back say: of what was found there, times what they show beyond the latent grid; and its square. In units of their noise.
-struct Told {
-    agreement: Plane,
-    power: Plane,
-}
-
-impl Told {
-    /// The part of what was found that they confirm, less where they do not say it clearly: 0..=1.
-    fn confirmed(&self) -> Plane {
-        let (agreement, power) = (self.agreement.box_sum(WITNESSES), self.power.box_sum(WITNESSES));
-        let square = self.agreement.map(|a| a * a).box_sum(WITNESSES);
-        let (w, h) = agreement.size();
-        Plane::from_fn(w, h, |x, y| {
-            let (a, p, s) = (agreement.at(x, y), power.at(x, y), square.at(x, y));
-            // The variance of a sum of terms of either sign is the sum of their squares.
-            if a > 0.0 && p > 0.0 { (a / (ENOUGH * p)).min(1.0) * (1.0 - s / (a * a)).max(0.0) } else { 0.0 }
-        })
-    }
-}
-
-impl Observation {
-    /// What pixel `at` says of the light `found` beyond what K makes of the latent grid, `coarse`: see [`Told`].
-    fn says(&self, at: usize, coarse: [f32; 3], found: [f32; 3]) -> [f32; 2] {
-        let mut said = [0.0; 2];
-        for c in 0..3 {
-            let exposure = self.exposure.0[c].data[at];
-            // A channel that is clipped says nothing.
-            if self.mask.data[at] > 0.0 && exposure > -0.5 {
-                let last = (self.noise[c].len() - 1) as f32;
-                let noise = self.noise[c][(exposure.clamp(0.0, 1.0).sqrt() * last) as usize];
-                said[0] += (exposure - coarse[c]) * found[c] / (noise * noise);
-                said[1] += (found[c] / noise).powi(2);
-            }
-        }
-        said
     }
 }
 
@@ -276,38 +269,35 @@ pub fn aliasing(
     progress: &mut dyn FnMut(f32) -> bool,
 ) -> Result<Vec<Option<Rgb>>> {
     let (w, h) = (start.width() - 2 * pad, start.height() - 2 * pad);
-    let sharp: Vec<(&Observation, DMat3)> = observations.iter().filter_map(|o| Some((o, o.tsf.single()?))).collect();
+    let sharp: Vec<Sharp> = observations.iter().filter_map(|o| Sharp::of(o, (start, pad))).collect();
     // Residual-driven weights are for what no grid explains.
     let settings = Settings { prior: Prior::Tv, robust: 0.0, ..settings.clone() };
     let displaced = |o: &&Observation| o.tsf.single().is_some() && !o.tsf.is_identity();
     let mut found: Vec<Option<Rgb>> = observations.iter().map(|o| Some(o).filter(displaced).map(|_| Rgb::filled(w, h, 0.0))).collect();
-    let nothing = |_: &Rgb| Told { agreement: Plane::filled(w, h, 0.0), power: Plane::filled(w, h, 0.0) };
-    let mut told: Vec<Option<Told>> = found.iter().map(|f| f.as_ref().map(nothing)).collect();
     let cores: Vec<(usize, usize)> = (0..h).step_by(tile).flat_map(|y| (0..w).step_by(tile).map(move |x| (x, y))).collect();
     for (k, &core) in cores.iter().enumerate() {
         let window = Window::around(core, tile, (w, h));
         let mut hear = |f: f32| progress((k as f32 + f) / cores.len() as f32);
         let fine = Fine::solve(gpu, kernels, &sharp, window, (start, pad), &settings, &mut hear)?;
-        for ((o, out), told) in observations.iter().zip(&mut found).zip(&mut told) {
-            if let (Some(out), Some(told), Some(motion)) = (out, told, o.tsf.single()) {
-                fine.write(o, &motion, core, tile, out, told);
+        for (o, out) in observations.iter().zip(&mut found) {
+            if let (Some(out), Some(motion)) = (out, o.tsf.single()) {
+                fine.write(&motion, o.exposure_time, core, tile, out);
             }
         }
     }
-    let certain = |((o, out), told): ((&Observation, Option<Rgb>), Option<Told>)| {
-        let confirmed = told?.confirmed();
-        Some(less_uncertain(&out?, o).map_planes(|p| p.zip(&confirmed, |f, k| f * k)))
-    };
-    Ok(observations.iter().zip(found).zip(told).map(certain).collect())
+    let trust = |o: &Observation| sharp.iter().find(|s| std::ptr::eq(s.frame, o)).map(|s| &s.trust);
+    let certain = |(o, out): (&Observation, Option<Rgb>)| Some(less_uncertain(&out?, o, trust(o)?));
+    Ok(observations.iter().zip(found).map(certain).collect())
 }
 
-/// `found` less what the noise of the frame may have made of it: by the part of its mean square around a pixel that noise explains (Wiener).
-fn less_uncertain(found: &Rgb, frame: &Observation) -> Rgb {
+/// `found` less what the noise of the frame, believed as `trust` has it, may have made of it: by the part of its mean square around a pixel that noise explains
+/// (Wiener).
+fn less_uncertain(found: &Rgb, frame: &Observation, trust: &Plane) -> Rgb {
     let significance = |c: usize| {
         let last = (frame.noise[c].len() - 1) as f32;
         found.0[c].zip(&frame.exposure.0[c], |f, x| (f / frame.noise[c][(x.clamp(0.0, 1.0).sqrt() * last) as usize]).powi(2))
     };
-    let squares = Rgb(std::array::from_fn(significance)).mean().box_sum(AROUND);
+    let squares = Rgb(std::array::from_fn(significance)).mean().zip(trust, |s, t| s * t * t).box_sum(AROUND);
     let all = ((2 * AROUND + 1) * (2 * AROUND + 1)) as f32;
     let part = squares.map(|s| (1.0 - all * NOISE * NOISE / s.max(f32::MIN_POSITIVE)).max(0.0));
     found.map_planes(|p| p.zip(&part, |f, k| f * k))
