@@ -8,6 +8,7 @@ use crate::image::{Plane, Rgb};
 use crate::mask;
 use crate::noise::{self, NoiseModel};
 use crate::pose::project;
+use crate::sampling::bilinear;
 use glam::{DMat3, DVec2};
 
 /// Squares of the frame of so many pixels a side are one where frames are compared, or more for frames of more than [`MOST`] of them: what moved is larger, and
@@ -103,14 +104,6 @@ impl Grid {
     }
 }
 
-/// `plane` at (x, y) between its squares; NaN if one of them is.
-fn between(plane: &Plane, at: DVec2) -> f32 {
-    let (fx, fy) = (at.x.floor(), at.y.floor());
-    let (u, v) = ((at.x - fx) as f32, (at.y - fy) as f32);
-    let p = |a: isize, b: isize| plane.clamped(fx as isize + a, fy as isize + b);
-    (1.0 - v) * ((1.0 - u) * p(0, 0) + u * p(1, 0)) + v * ((1.0 - u) * p(0, 1) + u * p(1, 1))
-}
-
 /// Mean over squares around.
 fn around(plane: &Plane, r: usize) -> Plane {
     let count = |a: usize, n: usize| ((a + r).min(n - 1) + 1 - a.saturating_sub(r)) as f32;
@@ -135,12 +128,12 @@ impl Sharp<'_> {
         };
         let last = DVec2::new(grid.size.0 as f64 - 1.0, grid.size.1 as f64 - 1.0);
         let outside = means(&|at| f32::from(at.min_element() < 0.0 || at.x > last.x || at.y > last.y));
-        let smooth = |c: usize| around(&means(&|at| between(&self.exposures[i].0[c], at)), SMOOTH);
+        let smooth = |c: usize| around(&means(&|at| bilinear(&self.exposures[i].0[c], at)), SMOOTH);
         let exposure: [Plane; 3] = std::array::from_fn(smooth);
         let burnt: [Plane; 3] = mask::spoilt_channels(frame).map(|clipped| {
             let clipped = Plane::from_fn(grid.size.0, grid.size.1, |x, y| f32::from(clipped[y * grid.size.0 + x]));
             // As whole numbers, which sums keep as they are.
-            means(&|at| between(&clipped, at)).map(f32::ceil).box_sum(SMOOTH)
+            means(&|at| bilinear(&clipped, at)).map(f32::ceil).box_sum(SMOOTH)
         });
         let averaged = ((2 * SMOOTH + 1) * grid.side).pow(2) as f32;
         let relative = |c: usize, x: f32| {
@@ -203,7 +196,7 @@ impl Sharp<'_> {
             let (w, h) = grid.size;
             Some(Plane::from_fn(w, h, |x, y| {
                 let place = DVec2::new(x as f64, y as f64) - grid.middle();
-                1.0 - between(&gone, grid.at(project(&back, place)))
+                1.0 - bilinear(&gone, grid.at(project(&back, place)))
             }))
         };
         (0..shown.len()).map(own).collect()

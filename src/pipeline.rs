@@ -904,12 +904,15 @@ impl Run<'_> {
         if displaced.is_empty() {
             return None;
         }
-        let (merged, _) = self.start(&displaced, 0);
         let masks: Vec<&Plane> = in_place.into_iter().map(|k| &self.masks[ids[k]]).collect();
         let lost = |p: usize| masks.iter().all(|m| m.data[p] == 0.0);
         let edge = |a: usize, n: usize| a < reach || a + reach >= n;
         let counts = |x: usize, y: usize| (edge(x, w) || edge(y, h)) && lost(y * w + x);
         let mask = Plane::from_fn(w, h, |x, y| f32::from(counts(x, y)));
+        if !mask.data.contains(&1.0) {
+            return None;
+        }
+        let (merged, _) = self.start(&displaced, 0);
         let brightest = (0..w * h).filter(|&p| mask.data[p] > 0.0).flat_map(|p| merged.pixel(p)).fold(0.0, f32::max);
         if brightest <= 0.0 {
             return None;

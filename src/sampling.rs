@@ -1,4 +1,4 @@
-//! Reading a plane between its pixels by cubic convolution (Keys 1981, a = -1/2), as the estimators do some hundred million times.
+//! Reading a plane between its pixels, bilinearly and by cubic convolution (Keys 1981, a = -1/2), as the estimators do some hundred million times.
 
 use crate::image::Plane;
 use glam::DVec2;
@@ -16,6 +16,14 @@ pub fn split(v: f64) -> (isize, f32) {
     let towards_zero = v as isize;
     let whole = towards_zero - isize::from(v < towards_zero as f64);
     (whole, (v - whole as f64) as f32)
+}
+
+/// Value at `q` (pixels from the first one), bilinear, the nearest pixel's outside; NaN beside one.
+pub fn bilinear(p: &Plane, q: DVec2) -> f32 {
+    let (x, y) = (q.x.floor(), q.y.floor());
+    let (u, v) = ((q.x - x) as f32, (q.y - y) as f32);
+    let at = |i: isize, j: isize| p.clamped(x as isize + i, y as isize + j);
+    (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1))
 }
 
 /// Weights of the four pixels around fraction `t`.

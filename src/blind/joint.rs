@@ -7,8 +7,9 @@ use crate::mask;
 use crate::merge::gradient_level;
 use crate::pose::{Pose, PoseGrid};
 use crate::random::Random;
+use crate::sampling::bilinear;
 use crate::tsf::{self, Latent, Stride, Tsf, WholeFrame};
-use glam::DMat3;
+use glam::{DMat3, DVec2};
 use nalgebra::Matrix2;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -185,14 +186,6 @@ fn shrunk(plane: &Plane, scale: usize) -> Plane {
     if scale == 1 { plane.clone() } else { shrunk(&plane.halved(), scale / 2) }
 }
 
-/// Bilinear sample.
-fn sample(plane: &Plane, x: f64, y: f64) -> f32 {
-    let (ix, iy) = (x.floor(), y.floor());
-    let (fx, fy) = ((x - ix) as f32, (y - iy) as f32);
-    let v = |i: isize, j: isize| plane.clamped(ix as isize + i, iy as isize + j);
-    (1.0 - fy) * ((1.0 - fx) * v(0, 0) + fx * v(1, 0)) + fy * ((1.0 - fx) * v(0, 1) + fx * v(1, 1))
-}
-
 /// Poses of a level `ratio` times coarser on the finer one, each spread over the pixels that its own pixel covers.
 fn spread(tsf: &Tsf, ratio: f64) -> Tsf {
     let d = 0.25 * ratio;
@@ -231,7 +224,7 @@ fn warp(latent: &Plane, m: &Pose) -> Plane {
     let (s, c) = m.theta_z_deg.to_radians().sin_cos();
     Plane::from_fn(latent.width, latent.height, |x, y| {
         let (u, v) = (x as f64 - cx - m.t_x, y as f64 - cy - m.t_y);
-        sample(latent, c * u + s * v + cx, -s * u + c * v + cy)
+        bilinear(latent, DVec2::new(c * u + s * v + cx, -s * u + c * v + cy))
     })
 }
 
@@ -500,7 +493,7 @@ impl Level {
     /// `latent` of this level on a grid of `size` plus `pad` pixels on every side, `ratio` of them to one of its own.
     fn enlarged(&self, latent: &Plane, ratio: usize, size: (usize, usize), pad: usize) -> Plane {
         let at = |v: usize| (v as f64 - pad as f64 + 0.5) / ratio as f64 - 0.5 + self.pad as f64;
-        Plane::from_fn(size.0 + 2 * pad, size.1 + 2 * pad, |x, y| sample(latent, at(x), at(y)))
+        Plane::from_fn(size.0 + 2 * pad, size.1 + 2 * pad, |x, y| bilinear(latent, DVec2::new(at(x), at(y))))
     }
 }
 

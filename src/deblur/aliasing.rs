@@ -12,6 +12,7 @@ use crate::gpu::Gpu;
 use crate::image::{Plane, Rgb};
 use crate::kernels::{Kernels, STILL};
 use crate::pose::{Pose, Projection, project};
+use crate::sampling::bilinear;
 use crate::tsf::{Interpolation, Tsf};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -56,9 +57,8 @@ impl<'a> Sharp<'a> {
             let seen = sample(start.0, STILL, back.of(DVec2::new(x as f64, y as f64) - middle) + middle + DVec2::splat(start.1 as f64));
             let mut sum = 0.0;
             for (c, seen) in seen.iter().enumerate() {
-                let (exposure, last) = (frame.exposure.0[c].data[p], (frame.noise[c].len() - 1) as f32);
-                let noise = frame.noise[c][(exposure.min(1.0).sqrt() * last) as usize];
-                sum += ((exposure - (seen * frame.exposure_time) as f32) / noise).powi(2) / 3.0;
+                let exposure = frame.exposure.0[c].data[p];
+                sum += ((exposure - (seen * frame.exposure_time) as f32) / deviation(frame, c, exposure)).powi(2) / 3.0;
             }
             Some(sum)
         };
@@ -74,13 +74,18 @@ impl<'a> Sharp<'a> {
             (OF_NOISE / quiet.max(OF_NOISE)).sqrt()
         };
         let (across, down) = (w.div_ceil(SQUARE), h.div_ceil(SQUARE));
-        let data: Vec<f32> = (0..across * down).into_par_iter().map(trusted).collect();
-        let squares = Rgb([(); 3].map(|()| Plane { width: across, height: down, data: data.clone() }));
+        let squares = Plane { width: across, height: down, data: (0..across * down).into_par_iter().map(trusted).collect() };
         // Between the squares' middles: a step would show.
         let middle = |a: usize| (a as f64 + 0.5) / SQUARE as f64 - 0.5;
-        let trust = Plane::from_fn(w, h, |x, y| sample(&squares, Interpolation::Bilinear, DVec2::new(middle(x), middle(y)))[0] as f32);
+        let trust = Plane::from_fn(w, h, |x, y| bilinear(&squares, DVec2::new(middle(x), middle(y))));
         Some(Self { frame, motion, trust })
     }
+}
+
+/// Standard deviation of channel `c` of `frame` at an exposure.
+fn deviation(frame: &Observation, c: usize, exposure: f32) -> f32 {
+    let last = (frame.noise[c].len() - 1) as f32;
+    frame.noise[c][(exposure.clamp(0.0, 1.0).sqrt() * last) as usize]
 }
 
 /// A part of the latent grid, and the same part of a frame as nearly as whole pixels go.
@@ -293,10 +298,7 @@ pub fn aliasing(
 /// `found` less what the noise of the frame, believed as `trust` has it, may have made of it: by the part of its mean square around a pixel that noise explains
 /// (Wiener).
 fn less_uncertain(found: &Rgb, frame: &Observation, trust: &Plane) -> Rgb {
-    let significance = |c: usize| {
-        let last = (frame.noise[c].len() - 1) as f32;
-        found.0[c].zip(&frame.exposure.0[c], |f, x| (f / frame.noise[c][(x.clamp(0.0, 1.0).sqrt() * last) as usize]).powi(2))
-    };
+    let significance = |c: usize| found.0[c].zip(&frame.exposure.0[c], |f, x| (f / deviation(frame, c, x)).powi(2));
     let squares = Rgb(std::array::from_fn(significance)).mean().zip(trust, |s, t| s * t * t).box_sum(AROUND);
     let all = ((2 * AROUND + 1) * (2 * AROUND + 1)) as f32;
     let part = squares.map(|s| (1.0 - all * NOISE * NOISE / s.max(f32::MIN_POSITIVE)).max(0.0));

@@ -5,6 +5,7 @@ use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::noise;
 use crate::pose::project;
+use crate::sampling::bilinear;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
@@ -217,14 +218,6 @@ fn all_valid(valid: &Plane, q: DVec2) -> bool {
 
 fn nearest(p: &Plane, q: DVec2) -> f32 {
     p.clamped(q.x.round() as isize, q.y.round() as isize)
-}
-
-/// Value at `q` (pixels from the first one), bilinear, the nearest pixel's outside.
-pub(super) fn bilinear(p: &Plane, q: DVec2) -> f32 {
-    let (x, y) = (q.x.floor(), q.y.floor());
-    let (u, v) = ((q.x - x) as f32, (q.y - y) as f32);
-    let at = |i: isize, j: isize| p.clamped(x as isize + i, y as isize + j);
-    (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1))
 }
 
 /// Keys' cubic convolution, a = -1/2.

@@ -20,11 +20,11 @@ const TABLE: &[(&str, &[&str])] = &[
     ("response", &["error", "image", "exposure", "mask"]),
     ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
     ("mask", &["error", "image", "exposure", "pose"]),
-    ("ghosts", &["image", "exposure", "mask", "noise", "pose::project"]),
+    ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),
     ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
     ("channels", &["image", "exposure", "mask", "merge", "noise"]),
-    ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft"]),
+    ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft", "sampling"]),
     ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
     ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
     ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative", "sampling"]),
@@ -33,7 +33,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("gpu", &["error"]),
     ("kernels", &["error", "gpu", "pose::project", "tsf::Interpolation", "tsf::Tap", "tsf::TapSet", "tsf::WARP_COST"]),
     ("collaborative", &["image", "pose::project", "sampling"]),
-    ("deblur", &["error", "image", "pose", "collaborative", "gpu", "kernels", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
+    ("deblur", &["error", "image", "pose", "collaborative", "gpu", "kernels", "sampling", "tsf::Interpolation", "tsf::TapSet", "tsf::Tsf"]),
     // All stages in order. Of the kernels it only opens the set.
     (
         "pipeline",
