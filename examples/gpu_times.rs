@@ -1,5 +1,5 @@
 //! Times of K, Kᵀ and an iteration of the conjugate gradients at several sizes, on the adapter that a merge would use:
-//! `cargo run --release --example gpu_times -- 1 12 24` (megapixels). `benches/peers.py --device cuda 1 12 24` times PyTorch at the same work.
+//! `cargo run --release --example gpu_times -- 1 12 24` (megapixels; and `operators` for K and Kᵀ alone). `benches/peers.py --device cuda 1 12 24` times PyTorch at the same work.
 
 #[path = "../benches/kernels/workload.rs"]
 mod workload;
@@ -79,16 +79,18 @@ fn main() -> Result<()> {
     let gpu = Gpu::new()?;
     println!("{}; 3 channels, 64 poses", gpu.description);
     let sizes: Vec<f64> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
+    let whole = !std::env::args().any(|a| a == "operators");
     for megapixels in sizes {
         let side = (megapixels * 1e6).sqrt() as usize;
         println!("{megapixels} MP, {side} x {side}");
         for interpolation in [Interpolation::Bilinear, Interpolation::Bicubic] {
             let kernels = Kernels::new(&gpu);
             let (k, adjoint) = operators(&gpu, &kernels, side, interpolation)?;
-            let iteration = iteration(&gpu, &kernels, side, interpolation)?;
-            println!(
-                "{megapixels} MP, {interpolation:?}: K {k:.3} ms, adjoint {adjoint:.3} ms; {FRAMES} frames, 2 shaken: iteration {iteration:.3} ms"
-            );
+            println!("{megapixels} MP, {interpolation:?}: K {k:.3} ms, adjoint {adjoint:.3} ms");
+            if whole {
+                let iteration = iteration(&gpu, &kernels, side, interpolation)?;
+                println!("  {FRAMES} frames, 2 shaken: iteration {iteration:.3} ms");
+            }
         }
     }
     Ok(())
