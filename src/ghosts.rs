@@ -24,8 +24,11 @@ const AROUND: usize = 2;
 const SEEN: f32 = 0.3;
 /// Radius in squares over which it is decided which frame counts.
 const REGION: usize = 8;
-/// What a place that a frame does not see costs it; one that it clips costs 1.
+/// What a place that a frame does not see costs it, and one of which it tells nothing; one that it clips costs 1.
 const NOT_SEEN: f32 = 2.0;
+const NOTHING: f32 = 1.5;
+/// What a relative standard deviation of 1 costs.
+const OF_DEVIATION: f32 = 3.0;
 /// Steps of a file's values that its exposures are not believed, beside their noise: JPEG files drop what is finer.
 const STEPS: f32 = 2.0;
 /// Relative variance of an exposure from which it tells nothing.
@@ -68,8 +71,9 @@ struct Shown {
     log: Rgb,
     /// Relative variance of E.
     variance: Rgb,
-    /// How little it is worth around a square: what of it is clipped, and its relative variance.
+    /// How little it is worth at a square, and around it: by what is clipped, and by its relative standard deviation.
     cost: Plane,
+    cost_around: Plane,
     clipped: Plane,
 }
 
@@ -136,10 +140,12 @@ impl Sharp<'_> {
             means(&|at| bilinear(&clipped, at)).map(f32::ceil).box_sum(SMOOTH)
         });
         let averaged = ((2 * SMOOTH + 1) * grid.side).pow(2) as f32;
+        // Frames of 8 bits that were reduced have finer steps, but what their file dropped did not come back.
+        let coarser = if frame.levels % 255 == 0 && frame.levels < 65535 { frame.levels as f32 / 255.0 } else { 1.0 };
         let relative = |c: usize, x: f32| {
             let (all, captured) = (noise::at(&self.curves[i][c], x).powi(2), self.noise.variance(f64::from(x)) as f32);
             // Rounding makes a twelfth of a step's square.
-            let rounding = 12.0 * (all - captured).max(0.0) * STEPS * STEPS;
+            let rounding = 12.0 * (all - captured).max(0.0) * STEPS * STEPS * coarser * coarser;
             (captured / averaged + rounding) / (x * x).max(f32::MIN_POSITIVE)
         };
         let variance = Rgb(std::array::from_fn(|c| exposure[c].map(|x| relative(c, x))));
@@ -149,10 +155,10 @@ impl Sharp<'_> {
             Plane::from_fn(w, h, |x, y| if tells(x, y) { (exposure[c].at(x, y) / time).ln() } else { f32::NAN })
         };
         let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
-        let noisy = variance.map_planes(|p| p.map(|v| v.min(1.0))).mean();
-        let cost = around(&clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }), REGION);
-        let cost = cost.zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
-        Shown { log: Rgb(std::array::from_fn(log)), variance, cost, clipped }
+        let noisy = variance.map_planes(|p| p.map(|v| if v > UNKNOWN { NOTHING } else { OF_DEVIATION * v.sqrt() })).mean();
+        let cost = clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
+        let cost_around = around(&cost, REGION).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
+        Shown { log: Rgb(std::array::from_fn(log)), variance, cost, cost_around, clipped }
     }
 
     /// Part of its weight that each of the sharp frames keeps at each of its pixels, 0..=1; `None` for one that keeps all of it.
@@ -160,38 +166,42 @@ impl Sharp<'_> {
         let grid = Grid::of(self.frames[self.ids[0]].intensity.size());
         let shown: Vec<Shown> = self.ids.iter().map(|&i| self.shown(i, grid)).collect();
         let (w, h) = grid.squares();
-        let cheapest = |pixels: &[usize]| {
-            let cost = |k: usize| pixels.iter().map(|&p| f64::from(shown[k].cost.data[p])).sum::<f64>();
-            (0..shown.len()).min_by(|&a, &b| cost(a).total_cmp(&cost(b))).unwrap_or(0)
+        let cheapest = |cost: &dyn Fn(usize) -> f64| {
+            let costs: Vec<f64> = (0..shown.len()).map(cost).collect();
+            (0..shown.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0)
         };
-        let mut keeper: Vec<usize> = (0..w * h).map(|p| cheapest(&[p])).collect();
-        let ghosts = |keeper: &[usize]| -> Vec<Option<Plane>> {
-            let of = |plane: &(dyn Fn(&Shown) -> &Plane + Sync)| Plane::from_fn(w, h, |x, y| plane(&shown[keeper[y * w + x]]).at(x, y));
-            let log = Rgb(std::array::from_fn(|c| of(&move |s| &s.log.0[c])));
-            let variance = Rgb(std::array::from_fn(|c| of(&move |s| &s.variance.0[c])));
-            (0..shown.len()).map(|k| shown[k].ghost(&log, &variance, |p| keeper[p] != k)).collect()
-        };
+        let mut keeper: Vec<usize> = (0..w * h).map(|p| cheapest(&|k| f64::from(shown[k].cost_around.data[p]))).collect();
+        let ghosts = |keeper: &[usize]| -> Vec<Option<Plane>> { shown.iter().map(|s| s.ghost(&shown, keeper)).collect() };
         let mut found = ghosts(&keeper);
-        // Who walks by is shown by one frame from head to foot.
+        // Who walks by is shown by one frame from head to foot, a sea by what is best here and there. What stood still beside it has no say in either.
         let any: Vec<bool> = (0..w * h).map(|p| found.iter().flatten().any(|g| g.data[p] > 0.0)).collect();
+        let mask = Plane::from_fn(w, h, |x, y| f32::from(any[y * w + x]));
+        let among = mask.box_sum(REGION);
+        let costs: Vec<Plane> =
+            shown.iter().map(|s| s.cost.zip(&mask, |c, m| c * m).box_sum(REGION).zip(&among, |c, n| c / n.max(1.0))).collect();
         let mut looked = vec![false; w * h];
         for p in 0..w * h {
             if any[p] && !looked[p] {
                 let whole = connected(&any, (w, h), p, &mut looked);
                 if whole.len() < w * h / SMALL_THING {
-                    let one = cheapest(&whole);
+                    let one = cheapest(&|k| whole.iter().map(|&q| f64::from(shown[k].cost.data[q])).sum());
                     whole.into_iter().for_each(|q| keeper[q] = one);
+                } else {
+                    whole.into_iter().for_each(|q| keeper[q] = cheapest(&|k| f64::from(costs[k].data[q])));
                 }
             }
         }
         if any.contains(&true) {
             found = ghosts(&keeper);
         }
-        let clipped = Plane::from_fn(w, h, |x, y| shown[keeper[y * w + x]].clipped.at(x, y));
+        // Where the frame that counts is clipped, or tells nothing, any other tells more.
+        let silent = Plane::from_fn(w, h, |x, y| {
+            let keeper = &shown[keeper[y * w + x]];
+            f32::from(keeper.clipped.at(x, y) > 0.0 || keeper.log.0.iter().any(|p| p.at(x, y).is_nan()))
+        });
         let own = |k: usize| {
             let ghost = around(found[k].as_ref()?, FADES);
-            // Where the frame that counts is clipped, any other tells more.
-            let gone = Plane::from_fn(w, h, |x, y| if keeper[y * w + x] == k || clipped.at(x, y) > 0.0 { 0.0 } else { ghost.at(x, y) });
+            let gone = Plane::from_fn(w, h, |x, y| if keeper[y * w + x] == k || silent.at(x, y) > 0.0 { 0.0 } else { ghost.at(x, y) });
             let back = self.motions[self.ids[k]].inverse();
             let (w, h) = grid.size;
             Some(Plane::from_fn(w, h, |x, y| {
@@ -204,15 +214,13 @@ impl Sharp<'_> {
 }
 
 impl Shown {
-    /// 1 where this frame and what `log` and `variance` tell of another do not show the same, of the squares that are `asked` for; `None` if nowhere.
-    fn ghost(&self, log: &Rgb, variance: &Rgb, asked: impl Fn(usize) -> bool + Sync) -> Option<Plane> {
-        let (w, h) = log.size();
-        // By how much there is too much left, and the same of the difference: 1 is too much.
-        let mut left = Plane::filled(w, h, 0.0);
-        let mut level = Plane::filled(w, h, 0.0);
+    /// By how much of what `other` shows around each square too much is left that this frame does not, and the same of the level: 1 is too much.
+    fn differences(&self, other: &Self) -> [Plane; 2] {
+        let (w, h) = self.cost.size();
+        let mut all = [Plane::filled(w, h, 0.0), Plane::filled(w, h, 0.0)];
         for c in 0..3 {
-            let (a, b) = (&log.0[c], &self.log.0[c]);
-            let counts = Plane::from_fn(w, h, |x, y| f32::from(asked(y * w + x) && a.at(x, y).is_finite() && b.at(x, y).is_finite()));
+            let (a, b) = (&other.log.0[c], &self.log.0[c]);
+            let counts = a.zip(b, |a, b| f32::from(a.is_finite() && b.is_finite()));
             let seen = around(&counts, AROUND);
             // Of differences from one value in the middle: f32 holds their squares.
             let values = || counts.data.iter().zip(&a.data).filter(|(n, _)| **n > 0.0).map(|(_, v)| f64::from(*v));
@@ -224,7 +232,7 @@ impl Shown {
             let (va, vb) = (|p: usize| a.data[p] - middle, |p: usize| b.data[p] - middle);
             let (ma, mb) = (mean(&va), mean(&vb));
             let (aa, bb, ab) = (mean(&|p| va(p) * va(p)), mean(&|p| vb(p) * vb(p)), mean(&|p| va(p) * vb(p)));
-            let noise = mean(&|p| variance.0[c].data[p] + self.variance.0[c].data[p]);
+            let noise = mean(&|p| other.variance.0[c].data[p] + self.variance.0[c].data[p]);
             let found = |x: usize, y: usize| {
                 if seen.at(x, y) < SEEN {
                     return [0.0; 2];
@@ -236,8 +244,22 @@ impl Shown {
                 let much = CONTRAST * CONTRAST + OF_NOISE * noise + OF_CONTRAST * aa.max(bb);
                 [rest / much, (ma - mb).abs() / (DIFFERENT + 2.0 * noise.sqrt())]
             };
-            left = Plane::from_fn(w, h, |x, y| found(x, y)[0].max(left.at(x, y)));
-            level = Plane::from_fn(w, h, |x, y| found(x, y)[1].max(level.at(x, y)));
+            all = [0, 1].map(|m| Plane::from_fn(w, h, |x, y| found(x, y)[m].max(all[m].at(x, y))));
+        }
+        all
+    }
+
+    /// 1 where this frame and that of `shown` which `keeper` names do not show the same; `None` if nowhere.
+    fn ghost(&self, shown: &[Self], keeper: &[usize]) -> Option<Plane> {
+        let (w, h) = self.cost.size();
+        let [mut left, mut level] = [Plane::filled(w, h, 0.0), Plane::filled(w, h, 0.0)];
+        for (i, other) in shown.iter().enumerate() {
+            if !std::ptr::eq(self, other) && keeper.contains(&i) {
+                let [l, d] = self.differences(other);
+                for p in (0..w * h).filter(|&p| keeper[p] == i) {
+                    (left.data[p], level.data[p]) = (l.data[p], d.data[p]);
+                }
+            }
         }
         let part: Vec<bool> = left.data.iter().zip(&level.data).map(|(s, d)| *s > GOES_ON || *d > 1.0).collect();
         let mut ghost = Plane::filled(w, h, 0.0);

@@ -136,6 +136,35 @@ fn a_small_thing_is_shown_by_one_frame() {
     }
 }
 
+/// Beside what longer frames burn out, the shortest one does not count alone for surroundings of which its file kept hardly more than a grey.
+#[test]
+fn a_dark_frame_does_not_speak_for_what_it_hardly_shows() {
+    let bright = |p: DVec2| p.x >= 70.0 && p.x < 130.0 && p.y >= 40.0;
+    let night = |p: DVec2, i: usize, c: usize| {
+        let clouds = 1.0 + 0.6 * (0.7 * p.x + 0.4 * p.y).sin();
+        match i {
+            _ if bright(p) => 4.0,
+            0 => 0.09,
+            _ => [0.05, 0.08, 0.14][c] * clouds,
+        }
+    };
+    let still = [DMat3::IDENTITY; 3];
+    let mut frames = photographed(&still, night, |_, x| x);
+    for frame in &mut frames {
+        // 8 bits, four by four pixels averaged.
+        frame.levels = 4 * 255;
+        frame.intensity = frame.intensity.map_planes(|p| p.map(|v| (v * 1020.0).round() / 1020.0));
+    }
+    let found = shares(&frames, &still);
+    for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
+        let near = |by: f64| [-by, 0.0, by].iter().any(|d| bright(DVec2::new(x as f64 + d, y as f64 + by)));
+        if !near(6.0) {
+            let counts = [1, 2].map(|i| found[i].as_ref().map_or(1.0, |s| s.at(x, y)));
+            assert_eq!(counts, [1.0; 2], "at {x}, {y}");
+        }
+    }
+}
+
 #[test]
 fn what_stands_still_is_no_ghost() {
     for motions in [[DMat3::IDENTITY; 3], displaced()] {
