@@ -134,11 +134,15 @@ impl Sharp<'_> {
         let outside = means(&|at| f32::from(at.min_element() < 0.0 || at.x > last.x || at.y > last.y));
         let smooth = |c: usize| around(&means(&|at| bilinear(&self.exposures[i].0[c], at)), SMOOTH);
         let exposure: [Plane; 3] = std::array::from_fn(smooth);
-        let burnt: [Plane; 3] = mask::spoilt_channels(frame).map(|clipped| {
-            let clipped = Plane::from_fn(grid.size.0, grid.size.1, |x, y| f32::from(clipped[y * grid.size.0 + x]));
-            // As whole numbers, which sums keep as they are.
-            means(&|at| bilinear(&clipped, at)).map(f32::ceil).box_sum(SMOOTH)
-        });
+        // How many of the squares around have a pixel that is lost; whole numbers, which sums keep as they are.
+        let near = |lost: &dyn Fn(usize) -> bool| {
+            let lost = Plane::from_vec(grid.size.0, grid.size.1, (0..grid.size.0 * grid.size.1).map(|p| f32::from(lost(p))).collect());
+            let lost = lost.expect("as many values as the frame has pixels");
+            means(&|at| bilinear(&lost, at)).map(f32::ceil).box_sum(SMOOTH)
+        };
+        let burnt = mask::spoilt_channels(frame).map(|clipped| near(&|p| clipped[p]));
+        // Noise below black is lost, and what is left of it looks too bright, and too even.
+        let black: [Plane; 3] = std::array::from_fn(|c| near(&|p| frame.intensity.0[c].data[p] <= 0.0));
         let averaged = ((2 * SMOOTH + 1) * grid.side).pow(2) as f32;
         // Frames of 8 bits that were reduced have finer steps, but what their file dropped did not come back.
         let coarser = if frame.levels % 255 == 0 && frame.levels < 65535 { frame.levels as f32 / 255.0 } else { 1.0 };
@@ -151,11 +155,13 @@ impl Sharp<'_> {
         let variance = Rgb(std::array::from_fn(|c| exposure[c].map(|x| relative(c, x))));
         let time = frame.exposure_time as f32;
         let log = |c: usize| {
-            let tells = |x: usize, y: usize| burnt[c].at(x, y) <= 0.0 && variance.0[c].at(x, y) <= UNKNOWN && outside.at(x, y) <= 0.0;
+            let lost = burnt[c].zip(&black[c], |b, d| b + d).zip(&outside, |l, o| l + o);
+            let tells = |x: usize, y: usize| lost.at(x, y) <= 0.0 && variance.0[c].at(x, y) <= UNKNOWN;
             Plane::from_fn(w, h, |x, y| if tells(x, y) { (exposure[c].at(x, y) / time).ln() } else { f32::NAN })
         };
         let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
-        let noisy = variance.map_planes(|p| p.map(|v| if v > UNKNOWN { NOTHING } else { OF_DEVIATION * v.sqrt() })).mean();
+        let worth = |v: f32, black: f32| if v > UNKNOWN || black > 0.0 { NOTHING } else { OF_DEVIATION * v.sqrt() };
+        let noisy = Rgb(std::array::from_fn(|c| variance.0[c].zip(&black[c], worth))).mean();
         let cost = clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
         let cost_around = around(&cost, REGION).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
         Shown { log: Rgb(std::array::from_fn(log)), variance, cost, cost_around, clipped }

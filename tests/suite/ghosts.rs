@@ -173,6 +173,16 @@ fn what_stands_still_is_no_ghost() {
             assert!(shares(&frames(&motions, false, bend), &motions).iter().all(Option::is_none));
         }
     }
+    // Noise that black cuts off, which makes one frame brighter than the next, and more of it than is known.
+    let still = [DMat3::IDENTITY; 3];
+    let mut frames = photographed(&still, |p, _, c| 0.02 * texture(1.0, p, c), |_, x| x);
+    for (i, frame) in frames.iter_mut().enumerate() {
+        for (c, plane) in frame.intensity.0.iter_mut().enumerate() {
+            let n = numbers(1000 + 10 * i as u64 + c as u64, SIZE.0 * SIZE.1);
+            plane.data.iter_mut().zip(n).for_each(|(v, n)| *v = ((*v + 3e-3 * n).max(0.0) * 4095.0).round() / 4095.0);
+        }
+    }
+    assert!(shares(&frames, &still).iter().all(Option::is_none));
     // Edges harder than the pixels, half a pixel and more off each other's.
     let scene = Drawn::Chart.draw(112, 80, 24, 4, 3);
     let still = Motion::new(synth::identity(112), false);
