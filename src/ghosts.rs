@@ -16,7 +16,7 @@ use glam::{DMat3, DVec2};
 const LEAST_SIDE: usize = 2;
 /// Pixels of the frame below which its pixels themselves are compared.
 const SMALL: usize = 64;
-const MOST: usize = 4_000_000;
+const MOST: usize = 1_000_000;
 /// Radius, in squares, over which they are smoothed: what pixels alias, and what is interpolated between them, is finer.
 const SMOOTH: usize = 1;
 /// Radius, in squares, of the surroundings that contrast is looked at in; and the part of them that has to be seen by both frames.
@@ -33,6 +33,8 @@ const OF_DEVIATION: f32 = 3.0;
 const STEPS: f32 = 2.0;
 /// Relative variance of an exposure from which it tells nothing.
 const UNKNOWN: f32 = 0.12;
+/// Part of its pixels that are black from which it tells nothing: noise below black is lost, and what is left of it looks too bright, and too even.
+const BLACK: f32 = 0.025;
 /// Contrast (of ln E) that may always be left, and the part of the contrast that there is and of the noise.
 const CONTRAST: f32 = 0.06;
 const OF_CONTRAST: f32 = 0.4;
@@ -134,15 +136,15 @@ impl Sharp<'_> {
         let outside = means(&|at| f32::from(at.min_element() < 0.0 || at.x > last.x || at.y > last.y));
         let smooth = |c: usize| around(&means(&|at| bilinear(&self.exposures[i].0[c], at)), SMOOTH);
         let exposure: [Plane; 3] = std::array::from_fn(smooth);
-        // How many of the squares around have a pixel that is lost; whole numbers, which sums keep as they are.
-        let near = |lost: &dyn Fn(usize) -> bool| {
-            let lost = Plane::from_vec(grid.size.0, grid.size.1, (0..grid.size.0 * grid.size.1).map(|p| f32::from(lost(p))).collect());
-            let lost = lost.expect("as many values as the frame has pixels");
-            means(&|at| bilinear(&lost, at)).map(f32::ceil).box_sum(SMOOTH)
+        // Of the pixels of a square, those that are lost.
+        let part = |lost: &dyn Fn(usize) -> bool| {
+            let (w, h) = grid.size;
+            let lost = Plane { width: w, height: h, data: (0..w * h).map(|p| f32::from(lost(p))).collect() };
+            means(&|at| bilinear(&lost, at))
         };
-        let burnt = mask::spoilt_channels(frame).map(|clipped| near(&|p| clipped[p]));
-        // Noise below black is lost, and what is left of it looks too bright, and too even.
-        let black: [Plane; 3] = std::array::from_fn(|c| near(&|p| frame.intensity.0[c].data[p] <= 0.0));
+        // As whole numbers, which sums keep as they are.
+        let burnt = mask::spoilt_channels(frame).map(|clipped| part(&|p| clipped[p]).map(f32::ceil).box_sum(SMOOTH));
+        let black: [Plane; 3] = std::array::from_fn(|c| around(&part(&|p| frame.intensity.0[c].data[p] <= 0.0), SMOOTH));
         let averaged = ((2 * SMOOTH + 1) * grid.side).pow(2) as f32;
         // Frames of 8 bits that were reduced have finer steps, but what their file dropped did not come back.
         let coarser = if frame.levels % 255 == 0 && frame.levels < 65535 { frame.levels as f32 / 255.0 } else { 1.0 };
@@ -155,12 +157,13 @@ impl Sharp<'_> {
         let variance = Rgb(std::array::from_fn(|c| exposure[c].map(|x| relative(c, x))));
         let time = frame.exposure_time as f32;
         let log = |c: usize| {
-            let lost = burnt[c].zip(&black[c], |b, d| b + d).zip(&outside, |l, o| l + o);
-            let tells = |x: usize, y: usize| lost.at(x, y) <= 0.0 && variance.0[c].at(x, y) <= UNKNOWN;
+            let lost = burnt[c].zip(&outside, |b, o| b + o);
+            let known = |x: usize, y: usize| black[c].at(x, y) <= BLACK && variance.0[c].at(x, y) <= UNKNOWN;
+            let tells = |x: usize, y: usize| lost.at(x, y) <= 0.0 && known(x, y);
             Plane::from_fn(w, h, |x, y| if tells(x, y) { (exposure[c].at(x, y) / time).ln() } else { f32::NAN })
         };
         let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
-        let worth = |v: f32, black: f32| if v > UNKNOWN || black > 0.0 { NOTHING } else { OF_DEVIATION * v.sqrt() };
+        let worth = |v: f32, black: f32| if v > UNKNOWN || black > BLACK { NOTHING } else { OF_DEVIATION * v.sqrt() };
         let noisy = Rgb(std::array::from_fn(|c| variance.0[c].zip(&black[c], worth))).mean();
         let cost = clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
         let cost_around = around(&cost, REGION).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
