@@ -764,8 +764,10 @@ impl Run<'_> {
         let (mut validating, mut fitted) = (true, Vec::new());
         let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
         let mut round = 0;
+        // TSFs that were given took no time.
+        let begun = if estimated.is_empty() { 0.0 } else { 0.40 };
         while round < rounds && !shaken.is_empty() {
-            let at = |part: f32| 0.40 + 0.58 * (round as f32 + part) / rounds as f32;
+            let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
                 for &i in estimated.iter().filter(|i| shaken.contains(i)) {
