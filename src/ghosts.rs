@@ -10,6 +10,7 @@ use crate::noise::{self, NoiseModel};
 use crate::pose::project;
 use crate::sampling::bilinear;
 use glam::{DMat3, DVec2};
+use rayon::prelude::*;
 
 /// Squares of the frame of so many pixels a side are one where frames are compared, or more for frames of more than [`MOST`] of them: what moved is larger, and
 /// what pixels alias is not.
@@ -165,8 +166,9 @@ impl Sharp<'_> {
         let clipped = burnt[0].zip(&burnt[1], f32::max).zip(&burnt[2], f32::max);
         let worth = |v: f32, black: f32| if v > UNKNOWN || black > BLACK { NOTHING } else { OF_DEVIATION * v.sqrt() };
         let noisy = Rgb(std::array::from_fn(|c| variance.0[c].zip(&black[c], worth))).mean();
-        let cost = clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
-        let cost_around = around(&cost, REGION).zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
+        let seen = |cost: Plane| cost.zip(&outside, |c, o| if o > 0.0 { NOT_SEEN } else { c });
+        let cost = seen(clipped.zip(&noisy, |c, n| if c > 0.0 { 1.0 } else { n }));
+        let cost_around = seen(around(&cost, REGION));
         Shown { log: Rgb(std::array::from_fn(log)), variance, cost, cost_around, clipped }
     }
 
@@ -179,28 +181,25 @@ impl Sharp<'_> {
             let costs: Vec<f64> = (0..shown.len()).map(cost).collect();
             (0..shown.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0)
         };
-        let mut keeper: Vec<usize> = (0..w * h).map(|p| cheapest(&|k| f64::from(shown[k].cost_around.data[p]))).collect();
+        let first: Vec<usize> = (0..w * h).map(|p| cheapest(&|k| f64::from(shown[k].cost_around.data[p]))).collect();
         let ghosts = |keeper: &[usize]| -> Vec<Option<Plane>> { shown.iter().map(|s| s.ghost(&shown, keeper)).collect() };
-        let mut found = ghosts(&keeper);
+        let mut found = ghosts(&first);
         // Who walks by is shown by one frame from head to foot, a sea by what is best here and there. What stood still beside it has no say in either.
         let any: Vec<bool> = (0..w * h).map(|p| found.iter().flatten().any(|g| g.data[p] > 0.0)).collect();
         let mask = Plane::from_fn(w, h, |x, y| f32::from(any[y * w + x]));
         let among = mask.box_sum(REGION);
         let costs: Vec<Plane> =
             shown.iter().map(|s| s.cost.zip(&mask, |c, m| c * m).box_sum(REGION).zip(&among, |c, n| c / n.max(1.0))).collect();
-        let mut looked = vec![false; w * h];
-        for p in 0..w * h {
-            if any[p] && !looked[p] {
-                let whole = connected(&any, (w, h), p, &mut looked);
-                if whole.len() < w * h / SMALL_THING {
-                    let one = cheapest(&|k| whole.iter().map(|&q| f64::from(shown[k].cost.data[q])).sum());
-                    whole.into_iter().for_each(|q| keeper[q] = one);
-                } else {
-                    whole.into_iter().for_each(|q| keeper[q] = cheapest(&|k| f64::from(costs[k].data[q])));
-                }
+        let mut keeper = first.clone();
+        for whole in wholes(&any, (w, h)) {
+            if whole.len() < w * h / SMALL_THING {
+                let one = cheapest(&|k| whole.iter().map(|&q| f64::from(shown[k].cost.data[q])).sum());
+                whole.into_iter().for_each(|q| keeper[q] = one);
+            } else {
+                whole.into_iter().for_each(|q| keeper[q] = cheapest(&|k| f64::from(costs[k].data[q])));
             }
         }
-        if any.contains(&true) {
+        if keeper != first {
             found = ghosts(&keeper);
         }
         // Where the frame that counts is clipped, or tells nothing, any other tells more.
@@ -224,9 +223,9 @@ impl Sharp<'_> {
 
 impl Shown {
     /// By how much of what `other` shows around each square too much is left that this frame does not, and the same of the level: 1 is too much.
-    fn differences(&self, other: &Self) -> [Plane; 2] {
+    fn differences(&self, other: &Self) -> Vec<[f32; 2]> {
         let (w, h) = self.cost.size();
-        let mut all = [Plane::filled(w, h, 0.0), Plane::filled(w, h, 0.0)];
+        let mut all = vec![[0.0f32; 2]; w * h];
         for c in 0..3 {
             let (a, b) = (&other.log.0[c], &self.log.0[c]);
             let counts = a.zip(b, |a, b| f32::from(a.is_finite() && b.is_finite()));
@@ -242,18 +241,21 @@ impl Shown {
             let (ma, mb) = (mean(&va), mean(&vb));
             let (aa, bb, ab) = (mean(&|p| va(p) * va(p)), mean(&|p| vb(p) * vb(p)), mean(&|p| va(p) * vb(p)));
             let noise = mean(&|p| other.variance.0[c].data[p] + self.variance.0[c].data[p]);
-            let found = |x: usize, y: usize| {
-                if seen.at(x, y) < SEEN {
+            let found = |p: usize| {
+                if seen.data[p] < SEEN {
                     return [0.0; 2];
                 }
-                let (ma, mb, noise) = (ma.at(x, y), mb.at(x, y), noise.at(x, y));
-                let (aa, bb, ab) = ((aa.at(x, y) - ma * ma).max(0.0), (bb.at(x, y) - mb * mb).max(0.0), ab.at(x, y) - ma * mb);
+                let (ma, mb, noise) = (ma.data[p], mb.data[p], noise.data[p]);
+                let (aa, bb, ab) = ((aa.data[p] - ma * ma).max(0.0), (bb.data[p] - mb * mb).max(0.0), ab.data[p] - ma * mb);
                 let k = (ab / aa.max(1e-9)).clamp(EXPONENT.0, EXPONENT.1);
                 let rest = bb - 2.0 * k * ab + k * k * aa - noise;
                 let much = CONTRAST * CONTRAST + OF_NOISE * noise + OF_CONTRAST * aa.max(bb);
                 [rest / much, (ma - mb).abs() / (DIFFERENT + 2.0 * noise.sqrt())]
             };
-            all = [0, 1].map(|m| Plane::from_fn(w, h, |x, y| found(x, y)[m].max(all[m].at(x, y))));
+            all.par_iter_mut().enumerate().for_each(|(p, most)| {
+                let [left, level] = found(p);
+                *most = [left.max(most[0]), level.max(most[1])];
+            });
         }
         all
     }
@@ -261,25 +263,18 @@ impl Shown {
     /// 1 where this frame and that of `shown` which `keeper` names do not show the same; `None` if nowhere.
     fn ghost(&self, shown: &[Self], keeper: &[usize]) -> Option<Plane> {
         let (w, h) = self.cost.size();
-        let [mut left, mut level] = [Plane::filled(w, h, 0.0), Plane::filled(w, h, 0.0)];
+        let mut much = vec![[0.0; 2]; w * h];
         for (i, other) in shown.iter().enumerate() {
             if !std::ptr::eq(self, other) && keeper.contains(&i) {
-                let [l, d] = self.differences(other);
-                for p in (0..w * h).filter(|&p| keeper[p] == i) {
-                    (left.data[p], level.data[p]) = (l.data[p], d.data[p]);
-                }
+                let found = self.differences(other);
+                (0..w * h).filter(|&p| keeper[p] == i).for_each(|p| much[p] = found[p]);
             }
         }
-        let part: Vec<bool> = left.data.iter().zip(&level.data).map(|(s, d)| *s > GOES_ON || *d > 1.0).collect();
+        let part: Vec<bool> = much.iter().map(|[left, level]| *left > GOES_ON || *level > 1.0).collect();
         let mut ghost = Plane::filled(w, h, 0.0);
         let mut found = false;
-        let mut looked = vec![false; w * h];
-        for p in 0..w * h {
-            if looked[p] || !part[p] {
-                continue;
-            }
-            let whole = connected(&part, (w, h), p, &mut looked);
-            if whole.iter().filter(|&&q| left.data[q] > 1.0).count() >= FEWEST {
+        for whole in wholes(&part, (w, h)) {
+            if whole.iter().filter(|&&q| much[q][0] > 1.0).count() >= FEWEST {
                 found = true;
                 whole.iter().for_each(|&q| ghost.data[q] = 1.0);
             }
@@ -288,22 +283,30 @@ impl Shown {
     }
 }
 
-/// The pixels of `part` that hang together with `from`, by rows and columns; they are marked as `looked` at.
-fn connected(part: &[bool], size: (usize, usize), from: usize, looked: &mut [bool]) -> Vec<usize> {
+/// The pixels of `part`, those together that hang together by rows and columns.
+fn wholes(part: &[bool], size: (usize, usize)) -> Vec<Vec<usize>> {
     let (w, h) = size;
-    let mut all = vec![from];
-    looked[from] = true;
-    let mut next = 0;
-    while let Some(&p) = all.get(next) {
-        next += 1;
-        let (x, y) = (p % w, p / w);
-        let neighbours = [(x > 0).then(|| p - 1), (x + 1 < w).then(|| p + 1), (y > 0).then(|| p - w), (y + 1 < h).then(|| p + w)];
-        for q in neighbours.into_iter().flatten() {
-            if part[q] && !looked[q] {
-                looked[q] = true;
-                all.push(q);
+    let mut looked = vec![false; w * h];
+    let mut found = Vec::new();
+    for from in 0..w * h {
+        if looked[from] || !part[from] {
+            continue;
+        }
+        let mut all = vec![from];
+        looked[from] = true;
+        let mut next = 0;
+        while let Some(&p) = all.get(next) {
+            next += 1;
+            let (x, y) = (p % w, p / w);
+            let neighbours = [(x > 0).then(|| p - 1), (x + 1 < w).then(|| p + 1), (y > 0).then(|| p - w), (y + 1 < h).then(|| p + w)];
+            for q in neighbours.into_iter().flatten() {
+                if part[q] && !looked[q] {
+                    looked[q] = true;
+                    all.push(q);
+                }
             }
         }
+        found.push(all);
     }
-    all
+    found
 }

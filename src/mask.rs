@@ -56,8 +56,16 @@ pub fn spoilt_channels(frame: &Frame) -> [Vec<bool>; 3] {
 /// `mask`, which is 0 where any channel of `frame` is clipped, for those who take each channel by itself: where some are clipped and others are
 /// not, the window's high end at the grey of them all, times `share` there. The colour of a lamp or of the sky is clipped in one channel long before it is
 /// in the others, which no other frame may show as well.
-pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: impl Fn(usize) -> f32 + Sync) -> Plane {
-    let (grey, clipped) = (grey(frame, Channels::ALL), spoilt_channels(frame));
+///
+/// `clipped`: [`spoilt_channels`] of the frame.
+pub fn with_partly_clipped(
+    mask: &Plane,
+    frame: &Frame,
+    clipped: &[Vec<bool>; 3],
+    alpha: f32,
+    share: impl Fn(usize) -> f32 + Sync,
+) -> Plane {
+    let grey = grey(frame, Channels::ALL);
     let one = |p: usize| match clipped.iter().filter(|c| c[p]).count() {
         1 | 2 => share(p) * low_taper(1.0 - grey.data[p], alpha),
         _ => mask.data[p],
@@ -68,7 +76,7 @@ pub fn with_partly_clipped(mask: &Plane, frame: &Frame, alpha: f32, share: impl 
 /// [`masks`] of all channels, each frame's [`with_partly_clipped`]: how frames count in the solver.
 pub fn counting(frames: &[Frame], sharp: &[bool], alpha: f32, motions: &[DMat3]) -> Vec<Plane> {
     let all = masks(frames, sharp, alpha, motions, Channels::ALL);
-    all.iter().zip(frames).map(|(m, f)| with_partly_clipped(m, f, alpha, |_| 1.0)).collect()
+    all.iter().zip(frames).map(|(m, f)| with_partly_clipped(m, f, &spoilt_channels(f), alpha, |_| 1.0)).collect()
 }
 
 /// Distance in pixels from what no frame knows up to which its light, blurred, is counted with.

@@ -937,19 +937,20 @@ impl Run<'_> {
         deblur::pad_for(&tsfs.collect::<Vec<_>>(), w, h, (LARGEST_PAD * w.max(h) as f64) as usize)
     }
 
-    /// The mask by which frame `i` counts in the solver.
-    fn counting(&self, i: usize) -> Plane {
+    /// The mask by which frame `i` counts in the solver. `clipped`: its [`mask::spoilt_channels`].
+    fn counting(&self, i: usize, clipped: &[Vec<bool>; 3]) -> Plane {
         let (all, kept) = (self.shares[i], self.ghosts[i].as_ref());
         let share = |p: usize| all * kept.map_or(1.0, |k| k.data[p]);
-        mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], self.settings.alpha as f32, share)
+        mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], clipped, self.settings.alpha as f32, share)
     }
 
     /// Frame `i`, every channel that is not clipped by itself.
     fn observation(&self, i: usize, tsf: Tsf) -> Observation {
         let frame = &self.bracket.frames()[i];
         let mut exposure = self.exposures[i].clone();
-        for (plane, clipped) in exposure.0.iter_mut().zip(mask::spoilt_channels(frame)) {
-            plane.data.iter_mut().zip(clipped).filter(|(_, clipped)| *clipped).for_each(|(e, _)| *e = UNSEEN);
+        let clipped = mask::spoilt_channels(frame);
+        for (plane, clipped) in exposure.0.iter_mut().zip(&clipped) {
+            plane.data.iter_mut().zip(clipped).filter(|(_, clipped)| **clipped).for_each(|(e, _)| *e = UNSEEN);
         }
         if let Some(finer) = &self.aliasing[i] {
             for (e, f) in exposure.0.iter_mut().zip(&finer.0) {
@@ -958,7 +959,7 @@ impl Run<'_> {
         }
         Observation {
             exposure,
-            mask: self.counting(i),
+            mask: self.counting(i, &clipped),
             exposure_time: frame.exposure_time,
             noise: self.curves[i].clone(),
             black_clipped: true,
@@ -1328,7 +1329,7 @@ impl Run<'_> {
             misfit[i] = Some(plane);
         }
         let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
-        let masks = (0..frames.len()).map(|i| self.counting(i)).collect();
+        let masks = (0..frames.len()).map(|i| self.counting(i, &mask::spoilt_channels(&frames[i]))).collect();
         let Self { left_out, degraded, .. } = self;
         Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
     }

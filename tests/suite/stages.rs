@@ -167,7 +167,7 @@ fn what_is_clipped_in_some_channels_counts_by_the_grey_of_all() {
     let intensity = Rgb([0, 1, 2].map(|c| Plane { width: pixels.len(), height: 1, data: pixels.iter().map(|p| p[c]).collect() }));
     let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, exposure_time: 1.0 };
     let mask = Plane { width: pixels.len(), height: 1, data: vec![0.8, 0.0, 0.0, 0.0, 0.0, 0.0] };
-    let found = mask::with_partly_clipped(&mask, &frame, 0.3, |_| 0.5).data;
+    let found = mask::with_partly_clipped(&mask, &frame, &mask::spoilt_channels(&frame), 0.3, |_| 0.5).data;
     // Greys of 0.65, 0.943 and 0.903: the first in the flat part of the window, the others 0.057 and 0.097 from its end.
     let taper = |z: f32| 0.5 * 0.5 * (1.0 - (2.0 * std::f32::consts::PI * z / 0.3).cos());
     for (got, expected) in found.iter().zip([0.8, 0.5, taper(0.057), 0.0, 0.0, taper(0.097)]) {
