@@ -5,7 +5,7 @@
     benches/peers.py --device cuda 1 12 24    PyTorch on a GPU at so many megapixels, beside `--example gpu_times` at the same work;
                                               elapsed time between events, medians; first what the GPU's memory and arithmetic allow
 
-pip install numpy opencv-python-headless torch (the CPU build of the last is about 200 MB; the processor's figures do without it).
+pip install numpy opencv-python-headless torch, or Debian's python3-torch; the processor's figures do without either of the last two.
 """
 import argparse
 import os
@@ -83,7 +83,10 @@ def processor_time(f, rounds):
 
 
 def on_processor():
-    print(f"OpenCV, K: {processor_time(by_opencv(1024), 5):.0f} ms")
+    try:
+        print(f"OpenCV, K: {processor_time(by_opencv(1024), 5):.0f} ms")
+    except ImportError:
+        print("OpenCV is not installed")
     try:
         import torch
     except ImportError:

@@ -113,10 +113,14 @@ const FLATTEST: Quantile = Quantile { at: 0.05, of_noise: 0.554 };
 /// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes; blocks of all frames and
 /// channels are pooled, since shot and read noise depend on the exposure alone; blurred frames contribute most, as blur
 /// removes texture but not noise. Where two frames show the same scene in the same place, their difference has no texture left; where they
-/// do not, it has more, and texture never lowers a variance. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is
+/// do not, it has more, and texture never lowers a variance. Samples that others at a like exposure undercut are left out: where bright parts are
+/// all texture and dark ones black, few blocks tell the noise. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is
 /// usable.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
-    let at_lag = |lag| fit(&samples(frames, exposures, response, lag), BELOW);
+    let at_lag = |lag| {
+        let samples = samples(frames, exposures, response, lag);
+        fit(&untextured(&samples, &fit(&samples, BELOW)?), BELOW)
+    };
     match (at_lag(1), at_lag(COARSE_LAG)) {
         // White noise reads the same at both lags, texture only lifts the coarse one a little.
         (Some(fine), Some(coarse)) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
@@ -171,18 +175,33 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
             (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
         blocks.collect::<Vec<Sample>>()
     };
-    let mut found = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST);
-    for (i, j) in pairs(frames, (0..frames.len()).collect()) {
+    let of_frames = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST);
+    let of_differences = pairs(frames, (0..frames.len()).collect()).into_iter().flat_map(|(i, j)| {
         let ratio = frames[i].exposure_time / frames[j].exposure_time;
         let differences = (0..3).into_par_iter().flat_map_iter(|c| {
             let less = Some((&frames[j].intensity.0[c], &exposures[j].0[c], ratio));
             let levels = frames[i].levels.min(frames[j].levels);
             collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels))
         });
-        found.extend(bins(differences.collect(), &FLATTEST));
-    }
-    found
+        bins(differences.collect(), &FLATTEST)
+    });
+    of_frames.into_iter().chain(of_differences).collect()
 }
+
+/// Exposures up to this factor apart count as alike.
+const ALIKE: f64 = 1.5;
+/// A sample shows texture where another has less than this part of its variance, both relative to the noise model.
+const UNDERCUT: f64 = 0.75;
+
+/// The samples that no other at a like exposure undercuts.
+fn untextured(samples: &[Sample], model: &NoiseModel) -> Vec<Sample> {
+    let relative: Vec<(f64, f64)> = samples.iter().map(|s| (s.exposure, s.variance / s.of(model))).collect();
+    let undercut = |&(x, v): &(f64, f64)| relative.iter().any(|&(y, u)| (x / y).max(y / x) < ALIKE && u < UNDERCUT * v);
+    samples.iter().zip(&relative).filter(|(_, r)| !undercut(r)).map(|(s, _)| *s).collect()
+}
+
+/// Blocks that a bin has at least.
+const FEWEST: usize = 30;
 
 /// Quantiles of bins of equal population along the exposure, none wider than a factor of 1.5.
 fn bins(mut blocks: Vec<Sample>, quantile: &Quantile) -> Vec<Sample> {
@@ -192,7 +211,7 @@ fn bins(mut blocks: Vec<Sample>, quantile: &Quantile) -> Vec<Sample> {
     while i < blocks.len() {
         let end = blocks[i..].partition_point(|b| b.exposure <= 1.5 * blocks[i].exposure) + i;
         let end = end.min(i + (blocks.len() / 40).max(200));
-        if end - i >= 60 {
+        if end - i >= FEWEST {
             let part = &blocks[i..end];
             let mut v: Vec<f64> = part.iter().map(|b| b.variance).collect();
             v.sort_by(f64::total_cmp);

@@ -90,6 +90,38 @@ fn texture_that_two_frames_share_is_no_noise() {
 }
 
 #[test]
+fn texture_that_most_blocks_show_is_no_noise() {
+    // Bright texture nearly everywhere: blocks of single frames outnumber those of the difference, which shows none.
+    let truth = noise::NoiseModel::from_electrons(4000.0, 8.0);
+    let (w, h) = (360, 240);
+    let grain = numbers(8, w * h);
+    let frame = |exposure_time: f64, seed: u64| {
+        let plane = |c: u64| {
+            let n = twelve(seed + 20 * c, w * h);
+            Plane::from_fn(w, h, |x, y| {
+                let level = (0.02 + 0.9 * (x as f64 / w as f64).sqrt()) * (1.0 + 0.12 * f64::from(grain[y * w + x]));
+                let e = exposure_time * level;
+                let z = e + truth.variance(e).sqrt() * f64::from(n[y * w + x]) / 2.0;
+                (z.clamp(0.0, 1.0) * 65535.0).round() as f32 / 65535.0
+            })
+        };
+        Frame {
+            name: "grain".into(),
+            intensity: Rgb([plane(0), plane(1), plane(2)]),
+            levels: 65535,
+            chroma_subsampled: false,
+            exposure_time,
+        }
+    };
+    let frames = [frame(1.0, 1000), frame(0.1, 2000)];
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+    let found = noise::estimate(&frames, &exposures, &Response::Linear);
+    let ratios = [0.002, 0.02, 0.1, 0.3].map(|x| found.variance(x) / truth.variance(x));
+    // Next to black only the few blocks of the difference tell the read noise.
+    assert!(ratios[0] > 0.6 && ratios[1..].iter().all(|r| (0.8..1.2).contains(r)), "{ratios:.2?} times the true variance");
+}
+
+#[test]
 fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
     let truth = noise::NoiseModel::from_electrons(1000.0, 6.0);
     let (w, h) = (320, 240);
