@@ -23,6 +23,9 @@ pub const TILE: usize = 448;
 /// Pixels around such a square that are solved with it. Of a frame that is turned by more than 4° the corners of squares lie farther off: nothing is taken off
 /// there.
 const MARGIN: usize = 16;
+/// Outer and inner iterations at most: what is found settles before the irradiance does.
+const OUTER: usize = 3;
+const INNER: usize = 10;
 /// What is found counts as noise up to so many of the frame's standard deviations, in squares of side 2 r + 1 around a pixel for this r.
 const NOISE: f32 = 0.4;
 const AROUND: usize = 2;
@@ -276,7 +279,8 @@ pub fn aliasing(
     let (w, h) = (start.width() - 2 * pad, start.height() - 2 * pad);
     let sharp: Vec<Sharp> = observations.iter().filter_map(|o| Sharp::of(o, (start, pad))).collect();
     // Residual-driven weights are for what no grid explains.
-    let settings = Settings { prior: Prior::Tv, robust: 0.0, ..settings.clone() };
+    let (outer, inner) = (settings.outer.min(OUTER), settings.inner.min(INNER));
+    let settings = Settings { prior: Prior::Tv, robust: 0.0, outer, inner, ..settings.clone() };
     let displaced = |o: &&Observation| o.tsf.single().is_some() && !o.tsf.is_identity();
     let mut found: Vec<Option<Rgb>> = observations.iter().map(|o| Some(o).filter(displaced).map(|_| Rgb::filled(w, h, 0.0))).collect();
     let cores: Vec<(usize, usize)> = (0..h).step_by(tile).flat_map(|y| (0..w).step_by(tile).map(move |x| (x, y))).collect();

@@ -1,0 +1,451 @@
+//! Irradiance and blurs in turn, from the sharp frames on.
+
+use super::blind::SetFree;
+use super::{Estimate, Event, Outcome, Run};
+use crate::deblur::{self, Observation, Prior, Solution};
+use crate::error::{Error, Result};
+use crate::ghosts;
+use crate::image::{Plane, Rgb};
+use crate::triage::Verdict;
+use crate::tsf::{self, Tsf};
+use glam::DMat3;
+use serde_json::Value;
+
+/// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
+const ROUNDS: usize = 2;
+/// Where a frame's blur leaves far more than noise, it must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
+pub(super) const UNEXPLAINED: f64 = 0.25;
+/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
+/// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
+const LONG: f64 = 12.0;
+/// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
+pub(super) const SLIGHT: f64 = 4.0;
+/// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
+/// smooths, and the residual-driven weights come late.
+const SHARP_OUTER: usize = 3;
+/// Outer iterations of the rounds before the last.
+const FIRST_OUTER: usize = 2;
+
+/// A bracket of which it is known which frames are sharp.
+pub(super) struct Sorted {
+    pub(super) verdicts: Vec<Verdict>,
+    /// Whether a TSF was given.
+    pub(super) known: Vec<bool>,
+    pub(super) used: Vec<usize>,
+    pub(super) sharp: Vec<bool>,
+    pub(super) tsfs: Vec<Option<Tsf>>,
+    /// Where no frame shows the scene: what to start from instead.
+    pub(super) scene: Option<Rgb>,
+    pub(super) centre: Option<usize>,
+    /// Whether the TSFs of all frames come from a smaller size.
+    pub(super) reduced: bool,
+    /// Whether the frames are merged as they are.
+    pub(super) unexplained: bool,
+    /// Whether sharp frames may have moved by a pixel or two all the same.
+    pub(super) may_have_moved: bool,
+}
+
+/// What is known of a bracket while irradiance and blurs are looked for in turn.
+struct Known {
+    verdicts: Vec<Verdict>,
+    /// Whether a TSF was given.
+    given: Vec<bool>,
+    reference: usize,
+    sharp: Vec<bool>,
+    still: Vec<usize>,
+    shaken: Vec<usize>,
+    /// Shaken frames whose blur is slight.
+    slight: Vec<usize>,
+    /// Shaken frames whose TSFs are looked for.
+    estimated: Vec<usize>,
+    tsfs: Vec<Option<Tsf>>,
+    /// What the report says of each frame's blur.
+    details: Vec<Value>,
+    /// The irradiance as it is known.
+    latent: Rgb,
+    /// What the sharp frames gave.
+    base: Option<Solution>,
+    /// Whether the TSFs of all frames come from a smaller size.
+    reduced: bool,
+}
+
+impl Known {
+    fn all(&self) -> Vec<usize> {
+        self.still.iter().chain(&self.shaken).copied().collect()
+    }
+}
+
+/// How the sharp frames alone (where none is, all) are solved for.
+struct SharpAlone {
+    frames: Vec<usize>,
+    placed: Vec<Option<Tsf>>,
+    initial: Rgb,
+    pad: usize,
+    settings: deblur::Settings,
+    /// Whether that has been done, with these settings.
+    converged: bool,
+}
+
+impl Run<'_> {
+    /// The irradiance of a bracket that is `sorted`.
+    pub(super) fn deblurred(mut self, sorted: Sorted) -> Result<Outcome> {
+        let noise = self.noise;
+        let (unexplained, may_have_moved) = (sorted.unexplained, sorted.may_have_moved);
+        let reference = self.laid_out(&sorted)?;
+        let (mut bracket, sharp_alone) = self.sharp_frames(sorted, reference)?;
+        self.estimate_blurs(&mut bracket)?;
+        if may_have_moved
+            && bracket.base.is_some()
+            && !unexplained
+            && bracket.still.len() + bracket.shaken.len() > 1
+            && let Some(stood) = self.ask_sharp_frames(&mut bracket)?
+        {
+            // Once more from these alone, without what was found beside the others.
+            self.memo.depends(&stood);
+            self.take_noise(noise);
+            let used = bracket.all();
+            for &i in &used {
+                (bracket.sharp[i], bracket.tsfs[i]) = (stood.contains(&i), None);
+            }
+            let Known { verdicts, given, sharp, tsfs, .. } = bracket;
+            return self.deblurred(Sorted {
+                verdicts,
+                known: given,
+                used,
+                sharp,
+                tsfs,
+                scene: None,
+                centre: None,
+                reduced: false,
+                unexplained: false,
+                may_have_moved: false,
+            });
+        }
+        let start = bracket.latent.clone();
+        let solution = self.rounds(&mut bracket, &start)?;
+        if bracket.shaken.is_empty() && !unexplained {
+            self.find_aliasing(&bracket.still, &bracket.shaken, &bracket.latent, 0.80, 0.90)?;
+        }
+        let solution = match (solution, bracket.base.take()) {
+            (Some(found), _) => found,
+            (None, Some(base)) if sharp_alone.converged && self.aliasing.iter().all(Option::is_none) => base,
+            // No shaken frame is left: the sharp ones alone, as the user wants them, from what they were for the estimates.
+            (None, base) => {
+                let SharpAlone { frames, placed, initial, pad, settings, .. } = sharp_alone;
+                let from = base.map_or(initial, |found| found.irradiance);
+                self.solved("sharp frames", "alone", &settings, |run| run.solve(&frames, &placed, &from, pad, &settings, 0.90, 0.98))?
+            }
+        };
+        self.progress("finishing", 0.99)?;
+        // For people to look at: patches and their PSFs, eq. (11), against the sharp frames.
+        for &i in &bracket.shaken {
+            if bracket.details[i].is_null() {
+                continue;
+            }
+            let own = format!("{i} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
+            let tsf = bracket.tsfs[i].as_ref().expect("frames without were left out");
+            bracket.details[i]["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, &start, tsf)))?;
+        }
+        let all = bracket.all();
+        self.finish(solution, reference, &bracket.verdicts, &bracket.sharp, &all, &bracket.tsfs, bracket.details)
+    }
+
+    /// Noise level, places, ghosts and masks of a bracket that is `sorted`; the reference frame.
+    fn laid_out(&mut self, sorted: &Sorted) -> Result<usize> {
+        let Sorted { verdicts, known, used, sharp, tsfs, scene, centre, unexplained, .. } = sorted;
+        let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+        // Blurred frames that are merged as they are differ by their blurs as well.
+        if !unexplained {
+            self.measure_noise(&still)?;
+        }
+        let found = self.bracket.longest(&still).or_else(|| self.bracket.shortest(used));
+        let reference = self.settings.reference.or(*centre).or(found).unwrap_or(0);
+        self.scale = self.bracket.frames()[reference].exposure_time;
+        if scene.is_some() {
+            for (motion, tsf) in self.motions.iter_mut().zip(tsfs) {
+                *motion = tsf.as_ref().map_or(*motion, Tsf::centre);
+            }
+        } else if known.iter().all(|k| !k) {
+            self.rebase(reference);
+        }
+        if !unexplained {
+            self.find_ghosts(&still)?;
+        }
+        self.weigh(sharp, used);
+        if *unexplained {
+            self.prefer_detail(|i| verdicts[i].detail);
+        }
+        Ok(reference)
+    }
+
+    /// The sharp frames alone, where no other scene is known: start of the solver, reference of the PSFs, and the result when nothing else helps.
+    fn sharp_frames(&mut self, sorted: Sorted, reference: usize) -> Result<(Known, SharpAlone)> {
+        let Sorted { verdicts, known, used, sharp, mut tsfs, scene, reduced, .. } = sorted;
+        let (still, shaken): (Vec<usize>, Vec<usize>) = used.into_iter().partition(|&i| sharp[i]);
+        let frames = if still.is_empty() { shaken.clone() } else { still.clone() };
+        self.progress("merging the sharp frames", 0.03)?;
+        let (initial, _) = self.start(&frames, 0);
+        for &i in &still {
+            tsfs[i] = Some(Tsf::still(self.motions[i]));
+        }
+        let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
+        // Without blur an iteration costs next to nothing: this solution may converge.
+        let settings = deblur::Settings {
+            outer: if frames.iter().any(|&i| self.motions[i] != DMat3::IDENTITY) { self.settings.deblur.outer } else { SHARP_OUTER },
+            ..self.settings.deblur.clone()
+        };
+        let first = if shaken.is_empty() { settings.clone() } else { for_estimates(&settings) };
+        let pad = self.pad(frames.iter().filter_map(|&i| placed[i].as_ref()));
+        let initial = self.surrounded(&initial, 0, pad, &still, &shaken);
+        let (base, latent) = match scene {
+            Some(scene) => (None, scene),
+            None => {
+                let found =
+                    self.solved("sharp frames", "", &first, |run| run.solve(&frames, &placed, &initial, pad, &first, 0.05, 0.10))?;
+                let latent = found.cropped();
+                (Some(found), latent)
+            }
+        };
+        let estimated = shaken.iter().copied().filter(|&i| tsfs[i].is_none()).collect();
+        let details = vec![Value::Null; sharp.len()];
+        let slight = Vec::new();
+        let converged = first == settings;
+        let known =
+            Known { verdicts, given: known, reference, sharp, still, shaken, slight, estimated, tsfs, details, latent, base, reduced };
+        Ok((known, SharpAlone { frames, placed, initial, pad, settings, converged }))
+    }
+
+    /// TSFs of the shaken frames of which none is known, against the sharp ones; a frame of which none is found is left out.
+    fn estimate_blurs(&mut self, bracket: &mut Known) -> Result<()> {
+        for (k, &i) in bracket.estimated.iter().enumerate() {
+            let part = k as f32 / bracket.estimated.len() as f32;
+            self.progress(&format!("estimating the blur of {}", self.bracket.frames()[i].name), 0.10 + 0.30 * part)?;
+            let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
+            let look = |run: &mut Self| Ok(run.estimate(i, &bracket.latent, |frame, search| frame.estimate(search)));
+            let (tsf, detail) = self.remembered("blur", &own, |_| 0, look)?;
+            if tsf.is_none() {
+                self.leave_out(
+                    i,
+                    "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
+                     time, or more detail where this frame is not clipped, would help)",
+                )?;
+            }
+            (bracket.tsfs[i], bracket.details[i]) = (tsf, detail);
+        }
+        self.memo.depends(&(self.settings.model, self.settings.focal_px));
+        bracket.shaken.retain(|&i| bracket.tsfs[i].is_some());
+        Ok(())
+    }
+
+    /// Whether frames that seem sharp have moved by a pixel or two: those that stood still, if only these may count as sharp. Where none stood, all are
+    /// shaken from here on, by the TSFs that were found.
+    fn ask_sharp_frames(&mut self, bracket: &mut Known) -> Result<Option<Vec<usize>>> {
+        let all = bracket.all();
+        let Known { still, tsfs, latent, reference, .. } = &*bracket;
+        let (found, blind) = self.remembered(
+            "slight blur",
+            "",
+            |_| 0,
+            |run| {
+                let found = run.set_free(&all, still, tsfs, latent, *reference)?;
+                Ok((found, run.blind.clone()))
+            },
+        )?;
+        self.blind = blind;
+        match found {
+            None => Ok(None),
+            Some(SetFree::Beside(stood)) => Ok(Some(stood)),
+            Some(SetFree::All(found)) => {
+                let (w, h) = self.bracket.size();
+                (bracket.latent, bracket.reduced, bracket.base) = (found.start, found.reduced, None);
+                for (&i, tsf) in all.iter().zip(found.tsfs) {
+                    if tsf::extent(&tsf, w, h) < SLIGHT {
+                        bracket.slight.push(i);
+                    }
+                    self.motions[i] = tsf.centre();
+                    (bracket.sharp[i], bracket.tsfs[i]) = (false, Some(tsf));
+                }
+                self.weigh(&bracket.sharp, &all);
+                (bracket.shaken, bracket.still, bracket.estimated) = (all, Vec::new(), Vec::new());
+                Ok(None)
+            }
+        }
+    }
+
+    /// Irradiance of all frames and their TSFs refined against it, in turn; frames that no blur explains are left out. `start`: irradiance before the
+    /// shaken frames counted. `None` where no shaken frame is left.
+    fn rounds(&mut self, bracket: &mut Known, start: &Rgb) -> Result<Option<Solution>> {
+        let (w, h) = self.bracket.size();
+        let mut solution = None;
+        let estimated = if bracket.reduced { bracket.shaken.clone() } else { std::mem::take(&mut bracket.estimated) };
+        let mut looked_at_twice: Vec<usize> = Vec::new();
+        let (mut validating, mut fitted) = (true, Vec::new());
+        let rounds = if estimated.is_empty() { 1 } else { ROUNDS };
+        let mut round = 0;
+        // TSFs that were given took no time.
+        let begun = if estimated.is_empty() { 0.0 } else { 0.40 };
+        while round < rounds && !bracket.shaken.is_empty() {
+            let Known { given, reference, still, shaken, slight, tsfs, details, latent, base, reduced, .. } = &mut *bracket;
+            let all: Vec<usize> = still.iter().chain(&*shaken).copied().collect();
+            let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
+            if round > 0 {
+                self.progress("refining the blur", at(0.0))?;
+                for &i in estimated.iter().filter(|i| shaken.contains(i)) {
+                    let now = format!("{i} {round} {shaken:?} {looked_at_twice:?} {validating}");
+                    tsfs[i] = self.remembered("refinement", &now, |_| 0, |run| Ok(run.refine(i, latent, tsfs[i].as_ref())))?;
+                }
+                fitted.clone_from(tsfs);
+                if validating {
+                    let now = format!("{round} {shaken:?} {looked_at_twice:?}");
+                    // Those that were given are what they are.
+                    let held: Vec<usize> = all.iter().copied().filter(|i| !estimated.contains(i)).collect();
+                    let look = |run: &mut Self| run.cross_validated(&all, &held, tsfs, latent, *reference, (at(0.05), at(0.2)));
+                    *tsfs = self.remembered("cross-validation", &now, |_| 0, look)?;
+                }
+            }
+            if round + 1 == rounds {
+                self.find_aliasing(still, shaken, latent, at(0.2), at(0.3))?;
+            }
+            let pad = self.pad(all.iter().filter_map(|&i| tsfs[i].as_ref()));
+            let from = match solution.as_ref().or(base.as_ref()) {
+                Some(found) => self.surrounded(&found.irradiance, found.pad, pad, still, shaken),
+                None => self.surrounded(latent, 0, pad, still, shaken),
+            };
+            // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
+            let settings = if round + 1 < rounds { for_first_round(&self.settings.deblur) } else { self.settings.deblur.clone() };
+            let now = format!("{round} {shaken:?} {looked_at_twice:?} {validating}");
+            let solved =
+                self.solved("irradiance", &now, &settings, |run| run.solve(&all, tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
+            let misfit = |i: usize| all.iter().position(|&k| k == i).map(|p| &solved.misfit[p]);
+            let judge = |&i: &usize| {
+                let length = tsf::stroke(tsfs[i].as_ref()?, w, h);
+                Some((i, self.unexplained(i, misfit(i)?, start, (UNEXPLAINED * LONG / length).clamp(UNEXPLAINED, 1.0))?))
+            };
+            // TSFs of a smaller size err by pixels of the frame's: they are judged once they have been refined.
+            let rough = *reduced && round + 1 < rounds;
+            let hopeless: Vec<(usize, f64)> = shaken.iter().filter(|i| !rough && !slight.contains(i)).filter_map(judge).collect();
+            if hopeless.is_empty() {
+                *latent = solved.cropped();
+                solution = Some(solved);
+                round += 1;
+                continue;
+            }
+            solution = None;
+            // Beside what clips everywhere no pixel is held out: what is wrong there is not seen before the frames are solved for.
+            if round > 0 && validating {
+                validating = false;
+                tsfs.clone_from(&fitted);
+                continue;
+            }
+            let ids: Vec<usize> = hopeless.iter().map(|h| h.0).filter(|i| !looked_at_twice.contains(i) && !details[*i].is_null()).collect();
+            looked_at_twice.extend(&ids);
+            if self.look_for_slight(&ids, start, tsfs, details, at(1.0))? {
+                continue;
+            }
+            // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
+            for (i, chi) in hopeless {
+                let what = if given[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
+                self.leave_out(i, &format!("{what} (its residual is {chi:.1} times its noise)"))?;
+                shaken.retain(|&k| k != i);
+            }
+        }
+        Ok(solution)
+    }
+
+    /// Solves for the frames `ids`; progress runs from `from` to `to`.
+    pub(super) fn solve(
+        &mut self,
+        ids: &[usize],
+        tsfs: &[Option<Tsf>],
+        initial: &Rgb,
+        pad: usize,
+        settings: &deblur::Settings,
+        from: f32,
+        to: f32,
+    ) -> Result<Solution> {
+        let (w, h) = self.bracket.size();
+        let mut observations: Vec<Observation> =
+            ids.iter().map(|&i| self.observation(i, tsfs[i].clone().unwrap_or_else(Tsf::identity))).collect();
+        if pad == 0 {
+            observations.extend(self.at_the_border(ids, &observations));
+        }
+        let moving = observations.iter().any(|o| !o.tsf.is_identity());
+        let stage = if moving { "deblurring" } else { "merging the sharp frames" };
+        self.progress(stage, from)?;
+        let events = std::cell::RefCell::new(&mut self.events);
+        let mut watch = |planes: &[wgpu::Buffer; 3]| {
+            let estimate = Estimate { planes: planes.clone(), width: w, height: h, pad, scale: self.scale };
+            events.borrow_mut()(Event::Estimate(estimate));
+        };
+        let mut hear = |f: f32| events.borrow_mut()(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f });
+        let mut solved = deblur::solve_watched(self.gpu, self.kernels, &observations, initial, pad, settings, &mut watch, &mut hear)?;
+        solved.misfit.truncate(ids.len());
+        solved.report.chi_squared.truncate(ids.len());
+        if solved.report.memory.reduced {
+            self.warn("the GPU's memory is short: the work is done in smaller pieces, which takes longer".into())?;
+        }
+        Ok(solved)
+    }
+
+    /// Where the sharp frames `still` do not show the same scene, and which of them counts there.
+    fn find_ghosts(&mut self, still: &[usize]) -> Result<()> {
+        if !self.settings.deghost || still.len() < 2 {
+            return Ok(());
+        }
+        let bytes = |found: &Vec<Option<Plane>>| found.iter().flatten().map(|f| 4 * f.data.len()).sum();
+        let found = self.remembered("ghosts", &format!("{still:?}"), bytes, |run| {
+            let Run { exposures, curves, noise, motions, .. } = &*run;
+            Ok(ghosts::Sharp { frames: run.bracket.frames(), exposures, curves, noise, motions, ids: still }.shares())
+        })?;
+        for (&i, share) in still.iter().zip(found) {
+            self.ghosts[i] = share;
+        }
+        Ok(())
+    }
+
+    /// What the displaced ones of the sharp frames `still` show of structure finer than the latent grid, unless that is known. `latent`: irradiance as it
+    /// is known. Progress runs from `from` to `to`.
+    fn find_aliasing(&mut self, still: &[usize], shaken: &[usize], latent: &Rgb, from: f32, to: f32) -> Result<()> {
+        let displaced = still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+        if !self.settings.between_pixels || still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some) {
+            return Ok(());
+        }
+        let settings = for_estimates(&self.settings.deblur);
+        let bytes = |found: &Vec<Option<Rgb>>| found.iter().flatten().map(|f| 12 * f.width() * f.height()).sum();
+        let found = self.remembered("aliasing", &format!("{shaken:?} {settings:?}"), bytes, |run| {
+            let observations: Vec<Observation> = still.iter().map(|&i| run.observation(i, Tsf::still(run.motions[i]))).collect();
+            let pad = run.pad(observations.iter().map(|o| &o.tsf));
+            let start = run.surrounded(latent, 0, pad, still, shaken);
+            let mut hear = |f: f32| {
+                (run.events)(Event::Progress {
+                    stage: "looking between the pixels of displaced frames".into(),
+                    fraction: from + (to - from) * f,
+                })
+            };
+            match deblur::aliasing(run.gpu, run.kernels, &observations, &start, pad, &settings, deblur::TILE, &mut hear) {
+                Err(Error::OutOfMemory(_) | Error::Adapter(_)) => {
+                    run.warn(
+                        "the GPU's memory is too short to look between the pixels of displaced frames: hard edges come out softer".into(),
+                    )?;
+                    Ok(vec![None; still.len()])
+                }
+                found => found,
+            }
+        })?;
+        for (&i, found) in still.iter().zip(found) {
+            self.aliasing[i] = found;
+        }
+        Ok(())
+    }
+}
+
+/// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.
+fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
+    let standard = deblur::Settings::default();
+    deblur::Settings { lambda: standard.lambda, prior: Prior::Tv, robust: standard.robust, ..settings.clone() }
+}
+
+/// [`for_estimates`], quick: enough to refine TSFs against, or to see whether they explain their frames.
+pub(super) fn for_first_round(settings: &deblur::Settings) -> deblur::Settings {
+    for_estimates(&deblur::Settings { inner: settings.inner * 3 / 8, outer: FIRST_OUTER, ..settings.clone() })
+}
