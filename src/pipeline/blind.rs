@@ -473,13 +473,13 @@ impl Run<'_> {
             tsfs[i] = Some(Tsf::still(self.motions[i]));
         }
         let all = [still, &judged].concat();
-        let settings = super::rounds::for_first_round(&self.settings.deblur);
+        let settings = super::shaken::for_first_round(&self.settings.deblur);
         let pad = self.pad(all.iter().filter_map(|&i| tsfs[i].as_ref()));
         let from = self.surrounded(scene, 0, pad, still, &judged);
         let solved = self.solve(&all, &tsfs, &from, pad, &settings, 0.02, 0.02)?;
         let misfits = all.iter().zip(&solved.misfit).skip(still.len());
         let failing: Vec<usize> = misfits
-            .filter(|(i, misfit)| self.unexplained(**i, misfit, scene, super::rounds::UNEXPLAINED).is_some())
+            .filter(|(i, misfit)| self.unexplained(**i, misfit, scene, super::shaken::UNEXPLAINED).is_some())
             .map(|(i, _)| *i)
             .collect();
         Ok(without(&blurred, &failing))
@@ -778,7 +778,7 @@ impl Run<'_> {
             return Ok(None);
         }
         let (stood, moved) = places.iter().partition::<Vec<usize>, _>(|&&k| found.extents[k] < STILL);
-        if !stood.is_empty() && moved.iter().all(|&k| found.extents[k] < super::rounds::SLIGHT) {
+        if !stood.is_empty() && moved.iter().all(|&k| found.extents[k] < super::shaken::SLIGHT) {
             return Ok(Some(SetFree::Beside(stood.iter().map(|&k| used[k]).collect())));
         }
         self.blind["believed"] = json!(true);

@@ -1,8 +1,9 @@
 //! Irradiance and blurs in turn, from the sharp frames on.
 
 use super::blind::SetFree;
+use super::shaken::{SLIGHT, UNEXPLAINED, for_estimates, for_first_round};
 use super::{Estimate, Event, Outcome, Run};
-use crate::deblur::{self, Observation, Prior, Solution};
+use crate::deblur::{self, Observation, Solution};
 use crate::error::{Error, Result};
 use crate::ghosts;
 use crate::image::{Plane, Rgb};
@@ -13,18 +14,12 @@ use serde_json::Value;
 
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
-/// Where a frame's blur leaves far more than noise, it must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
-pub(super) const UNEXPLAINED: f64 = 0.25;
 /// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
 /// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
 const LONG: f64 = 12.0;
-/// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
-pub(super) const SLIGHT: f64 = 4.0;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
 /// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
-/// Outer iterations of the rounds before the last.
-const FIRST_OUTER: usize = 2;
 
 /// A bracket of which it is known which frames are sharp.
 pub(super) struct Sorted {
@@ -437,15 +432,4 @@ impl Run<'_> {
         }
         Ok(())
     }
-}
-
-/// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.
-fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
-    let standard = deblur::Settings::default();
-    deblur::Settings { lambda: standard.lambda, prior: Prior::Tv, robust: standard.robust, ..settings.clone() }
-}
-
-/// [`for_estimates`], quick: enough to refine TSFs against, or to see whether they explain their frames.
-pub(super) fn for_first_round(settings: &deblur::Settings) -> deblur::Settings {
-    for_estimates(&deblur::Settings { inner: settings.inner * 3 / 8, outer: FIRST_OUTER, ..settings.clone() })
 }

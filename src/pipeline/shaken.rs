@@ -1,8 +1,8 @@
 //! Blurs of shaken frames against the irradiance that others show: their TSFs, their PSFs, and whether they explain them.
 
 use super::Run;
-use super::rounds::SLIGHT;
 use crate::channels;
+use crate::deblur::{self, Prior};
 use crate::error::Result;
 use crate::image::{Channels, Plane, Rgb};
 use crate::merge;
@@ -23,6 +23,12 @@ const HOPELESS: f64 = 8.0;
 const SQUARES: usize = 48;
 const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
+/// Where a frame's blur leaves far more than noise, it must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
+pub(super) const UNEXPLAINED: f64 = 0.25;
+/// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
+pub(super) const SLIGHT: f64 = 4.0;
+/// Outer iterations of the rounds before the last.
+const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
 const PATCHES: usize = 9;
 /// Side of a patch in pixels.
@@ -228,4 +234,15 @@ impl Run<'_> {
     pub(super) fn refine(&self, i: usize, latent: &Rgb, tsf: Option<&Tsf>) -> Option<Tsf> {
         tsf.map(|t| self.luminances(i, latent, &t.base).frame(t.base).refine(t, REFINED))
     }
+}
+
+/// The settings with the default smoothing and weights: what is estimated of the blur does not follow the taste in results.
+pub(super) fn for_estimates(settings: &deblur::Settings) -> deblur::Settings {
+    let standard = deblur::Settings::default();
+    deblur::Settings { lambda: standard.lambda, prior: Prior::Tv, robust: standard.robust, ..settings.clone() }
+}
+
+/// [`for_estimates`], quick: enough to refine TSFs against, or to see whether they explain their frames.
+pub(super) fn for_first_round(settings: &deblur::Settings) -> deblur::Settings {
+    for_estimates(&deblur::Settings { inner: settings.inner * 3 / 8, outer: FIRST_OUTER, ..settings.clone() })
 }
