@@ -1,6 +1,6 @@
 //! `unshaken baseline`: what one would do instead of deblurring all frames together, judged side by side.
 
-use super::{Usage, compare, frames, merge, with_progress};
+use super::{Usage, compare, frames, given, with_progress};
 use crate::baseline;
 use crate::experiments::Joint;
 use crate::io::exr::{self, Radiometry};
@@ -104,15 +104,15 @@ struct Made {
 
 pub(super) fn run(args: &BaselineArgs) -> anyhow::Result<()> {
     let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
-    let sharp = args.sharp.as_deref().map(|l| merge::frame_numbers("--sharp", l, args.frames.len())).transpose()?;
+    let sharp = args.sharp.as_deref().map(|l| given::frame_numbers("--sharp", l, args.frames.len())).transpose()?;
     frames::check(&args.frames)?;
     let methods = methods(args)?;
     let response = match Response::named(&args.response).map_err(|e| Usage(format!("--response: {e}")))? {
         Some(response) => response,
-        None => merge::read_response(Path::new(&args.response))?,
+        None => given::read_response(Path::new(&args.response))?,
     };
-    let tsf = args.tsf.as_deref().map(merge::read_tsf).transpose()?;
-    let blind = merge::blind(args.blind.as_deref())?;
+    let tsf = args.tsf.as_deref().map(given::read_tsf).transpose()?;
+    let blind = given::blind(args.blind.as_deref())?;
     std::fs::create_dir_all(&args.output_dir)
         .with_context(|| format!("{}: cannot be made; choose another --output-dir", args.output_dir.display()))?;
     let target = |m: Method, extension: &str| Output::check(&args.output_dir.join(format!("{}.{extension}", m.name())), args.overwrite);

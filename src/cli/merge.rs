@@ -2,7 +2,7 @@
 
 use super::args::MergeArgs;
 use super::progress::done;
-use super::{Done, Usage, frames, interrupt, page, with_progress};
+use super::{Done, Usage, frames, given, interrupt, page, with_progress};
 use crate::colour::{self, Matrix, Primaries};
 use crate::deblur::Prior;
 use crate::error::Error;
@@ -13,7 +13,7 @@ use crate::io::output::{self, Output};
 use crate::layers;
 use crate::noise::NoiseModel;
 use crate::pipeline::{self, Blind, Event, Outcome, Settings};
-use crate::response::{Response, ResponseFile};
+use crate::response::Response;
 use crate::tonemap::Operator;
 use crate::tsf::{Interpolation, Model, TsfFile};
 use serde_json::{Value, json};
@@ -94,7 +94,7 @@ impl<'a> Asked<'a> {
         let times = args.exposures.as_deref().map(|list| frames::exposure_times(list, &args.frames)).transpose()?;
         let values = args.photo.ev.as_deref().map(|list| frames::exposure_values(list, &args.frames)).transpose()?;
         let settings = settings(args)?;
-        let divisor = args.scale.as_deref().map_or(Ok(1), divisor)?;
+        let divisor = args.scale.as_deref().map_or(Ok(1), given::divisor)?;
         frames::check(&args.frames)?;
         let word = args.response.as_deref().filter(|r| *r != "auto");
         let named = word.map(Response::named).transpose().map_err(|e| Usage(format!("--response: {e}")))?.flatten();
@@ -132,12 +132,12 @@ impl<'a> Asked<'a> {
         let args = self.args;
         let photo = PhotoSettings::of(args)?;
         let response = match &self.response_file {
-            Some(path) => Some(read_response(path)?),
+            Some(path) => Some(given::read_response(path)?),
             None => self.named.clone(),
         };
-        let tsf = args.tsf.as_deref().map(read_tsf).transpose()?;
+        let tsf = args.tsf.as_deref().map(given::read_tsf).transpose()?;
         if let (Some(file), Some(path)) = (&tsf, &args.tsf) {
-            check_tsf_names(file, path, &args.frames)?;
+            given::check_tsf_names(file, path, &args.frames)?;
         }
         Ok(Job { asked: self, response, tsf, photo })
     }
@@ -156,7 +156,7 @@ impl Job<'_> {
         }
         let frames::Loaded { bracket, stated, to_xyz, metadata, noise, notes } = loaded;
         if let (Some(file), Some(path)) = (&self.tsf, &args.tsf) {
-            check_tsfs(file, path, &bracket)?;
+            given::check_tsfs(file, path, &bracket)?;
         }
         for note in &notes {
             events(Event::Warning(note.clone()));
@@ -415,29 +415,17 @@ fn summary(args: &MergeArgs, bracket: &Bracket, reference: usize, relative: bool
     )
 }
 
-/// `--blind`.
-pub(super) fn blind(word: Option<&str>) -> Result<Blind, Usage> {
-    match word {
-        None => Ok(Blind::default()),
-        Some("auto") => Ok(Blind::Auto),
-        Some("joint") => Ok(Blind::Joint),
-        Some("patches") => Ok(Blind::Patches),
-        Some("off") => Ok(Blind::Off),
-        Some(word) => Err(Usage(format!("--blind: {word:?} is neither auto, joint, patches nor off"))),
-    }
-}
-
 fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     let n = args.frames.len();
     let mut settings = Settings { align: !args.no_align, deghost: !args.keep_ghosts, ..Settings::default() };
     if let Some(word) = &args.reference {
-        settings.reference = Some(frame_number("--reference", word, n)?);
+        settings.reference = Some(given::frame_number("--reference", word, n)?);
     }
     if let Some(list) = &args.sharp {
-        settings.sharp = Some(frame_numbers("--sharp", list, n)?);
+        settings.sharp = Some(given::frame_numbers("--sharp", list, n)?);
     }
     if let Some(list) = &args.exclude {
-        settings.exclude = frame_numbers("--exclude", list, n)?;
+        settings.exclude = given::frame_numbers("--exclude", list, n)?;
     }
     if let Some(word) = &args.alpha {
         settings.alpha = word
@@ -480,15 +468,15 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     if let Some(robust) = number("--robust", &args.robust, (0.0, 100.0))? {
         settings.deblur.robust = robust;
     }
-    settings.noise = args.noise.as_deref().map(noise_level).transpose()?;
+    settings.noise = args.noise.as_deref().map(given::noise_level).transpose()?;
     settings.deblur.prior = if args.prior == "tv" { Prior::Tv } else { Prior::Collaborative };
     settings.deblur.interpolation = match args.interpolation.as_str() {
         "bilinear" => Interpolation::Bilinear,
         "six-point" => Interpolation::SixPoint,
         _ => Interpolation::Bicubic,
     };
-    settings.deblur.memory_limit = args.memory_limit.as_deref().map(bytes).transpose()?;
-    settings.blind = blind(args.blind.as_deref())?;
+    settings.deblur.memory_limit = args.memory_limit.as_deref().map(given::bytes).transpose()?;
+    settings.blind = given::blind(args.blind.as_deref())?;
     if let Some(word) = args.blind.as_deref().filter(|w| matches!(*w, "joint" | "patches") && args.tsf.is_some()) {
         return Err(Usage(format!("--blind {word} estimates the TSFs that --tsf gives; leave one of them out")));
     }
@@ -516,67 +504,6 @@ fn settings(args: &MergeArgs) -> Result<Settings, Usage> {
     Ok(settings)
 }
 
-/// The whole number that `--scale` is one over.
-fn divisor(word: &str) -> Result<usize, Usage> {
-    let divisor = word.parse::<f64>().ok().filter(|s| *s > 0.0 && *s <= 1.0).map(|s| (1.0 / s, (1.0 / s).round()));
-    match divisor {
-        Some((exact, whole)) if (exact - whole).abs() <= 0.02 * whole && whole <= 1000.0 => Ok(whole as usize),
-        _ => Err(Usage(format!("--scale: {word:?} is not one over a whole number; give 1, 0.5, 0.333, 0.25, ..."))),
-    }
-}
-
-/// Bytes of a size such as 2GiB, 1.5GB or 800MiB.
-fn bytes(word: &str) -> Result<u64, Usage> {
-    let split = word.find(|c: char| c.is_alphabetic()).unwrap_or(word.len());
-    let (number, unit) = word.split_at(split);
-    let unit = match unit.to_lowercase().as_str() {
-        "gib" | "g" => 1u64 << 30,
-        "mib" | "m" => 1 << 20,
-        "gb" => 1_000_000_000,
-        "mb" => 1_000_000,
-        _ => 0,
-    };
-    match number.trim().parse::<f64>() {
-        Ok(n) if n.is_finite() && n > 0.0 && unit > 0 => Ok((n * unit as f64) as u64),
-        _ => Err(Usage(format!("--memory-limit: {word:?} is not a size; give a number with a unit, such as 2GiB or 800MiB"))),
-    }
-}
-
-/// Frame number, counted from 1, to an index.
-fn frame_number(option: &str, word: &str, frames: usize) -> Result<usize, Usage> {
-    match word.trim().parse::<usize>() {
-        Ok(n) if (1..=frames).contains(&n) => Ok(n - 1),
-        Ok(n) => Err(Usage(format!("{option}: there is no frame {n}; frames are counted from 1 to {frames}"))),
-        Err(_) => Err(Usage(format!("{option}: {word:?} is not a frame number; frames are counted from 1 to {frames}"))),
-    }
-}
-
-pub(super) fn frame_numbers(option: &str, list: &str, frames: usize) -> Result<Vec<usize>, Usage> {
-    let mut indices = Vec::new();
-    for word in list.split(',') {
-        let i = frame_number(option, word, frames)?;
-        if indices.contains(&i) {
-            return Err(Usage(format!("{option}: frame {} is named twice; name it once", i + 1)));
-        }
-        indices.push(i);
-    }
-    Ok(indices)
-}
-
-/// The level that `--noise` gives.
-fn noise_level(text: &str) -> Result<NoiseModel, Usage> {
-    let refuse =
-        || Usage(format!("--noise: {text:?} is not a full well of at least 1 and a read noise of at least 0 electrons, such as 12000,6"));
-    let (well, read) = text.split_once(',').ok_or_else(refuse)?;
-    match (well.trim().parse::<f64>(), read.trim().parse::<f64>()) {
-        // A read noise of nothing would divide by nothing where the frame is black; a tenth of an electron is as good.
-        (Ok(w), Ok(r)) if w.is_finite() && w >= 1.0 && r.is_finite() && (0.0..=w).contains(&r) => {
-            Ok(NoiseModel::from_electrons(w, r.max(0.1)))
-        }
-        _ => Err(refuse()),
-    }
-}
-
 /// The outputs, of which each can be written.
 pub(super) struct Targets {
     linear: Output,
@@ -600,51 +527,6 @@ fn check_format(args: &MergeArgs) -> Result<(), Usage> {
     }
     if photo.layers && ending != "exr" {
         return refuse("--layers", "only OpenEXR holds further channels; name the output .exr");
-    }
-    Ok(())
-}
-
-pub(super) fn read_response(path: &Path) -> Result<Response, Error> {
-    if !path.exists() {
-        let reason = "is neither auto, srgb, linear, gamma:NUMBER nor an existing file; give --response one of these".into();
-        return Err(Error::Format { path: path.into(), reason });
-    }
-    let text = crate::io::read_text(path)?;
-    ResponseFile::parse(&text).map(|f| f.response()).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
-}
-
-pub(super) fn read_tsf(path: &Path) -> Result<TsfFile, Error> {
-    let text = crate::io::read_text(path)?;
-    TsfFile::parse(&text).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })
-}
-
-/// TSF files find frames by file name: one that fits no frame, or a name that two frames share, would be used silently wrong.
-fn check_tsf_names(file: &TsfFile, path: &Path, frames: &[PathBuf]) -> Result<(), Error> {
-    let refuse = |reason| Err(Error::Format { path: path.into(), reason });
-    let names = frames::names(frames);
-    for (i, entry) in file.frames.iter().enumerate() {
-        if file.frames[..i].iter().any(|e| e.frame == entry.frame) {
-            return refuse(format!("holds two TSFs of {:?}; keep one", entry.frame));
-        }
-        let sharing = frames.iter().filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy() == entry.frame)).count();
-        if sharing > 1 {
-            return refuse(format!(
-                "holds a TSF of {:?}, a name that {sharing} frames share; give the frames different file names",
-                entry.frame
-            ));
-        }
-    }
-    if !file.frames.iter().any(|e| names.contains(&e.frame)) {
-        return refuse(format!("holds no TSF of any of the frames ({}); it names frames by file name, without folder", names.join(", ")));
-    }
-    Ok(())
-}
-
-/// Refuses TSFs that do not fit the frames before the work begins.
-fn check_tsfs(file: &TsfFile, path: &Path, bracket: &Bracket) -> Result<(), Error> {
-    let (width, height) = bracket.size();
-    for frame in bracket.frames() {
-        file.find(&frame.name, width, height).map_err(|e| Error::Format { path: path.into(), reason: e.to_string() })?;
     }
     Ok(())
 }

@@ -13,6 +13,7 @@ pub mod demo;
 mod experiment;
 mod frames;
 mod generate;
+mod given;
 mod grouping;
 mod interrupt;
 mod merge;

@@ -1,6 +1,6 @@
 //! `unshaken synth`: a hand-held bracket with known truth.
 
-use super::{Usage, with_progress};
+use super::{Usage, given, with_progress};
 use crate::error::Error;
 use crate::exposure::Frame;
 use crate::image::Rgb;
@@ -301,7 +301,7 @@ fn numbers(args: &SynthArgs) -> anyhow::Result<Numbers> {
         Some("all") => vec![true; n],
         Some("none") => vec![false; n],
         Some(list) => {
-            let listed = super::merge::frame_numbers("--shaken", list, n)?;
+            let listed = given::frame_numbers("--shaken", list, n)?;
             (0..n).map(|i| listed.contains(&i)).collect()
         }
     };
@@ -360,7 +360,7 @@ fn numbers(args: &SynthArgs) -> anyhow::Result<Numbers> {
 fn response(word: &str) -> anyhow::Result<Response> {
     match Response::named(word).map_err(|e| Usage(format!("--response: {e}")))? {
         Some(response) => Ok(response),
-        None => Ok(super::merge::read_response(Path::new(word))?),
+        None => Ok(given::read_response(Path::new(word))?),
     }
 }
 
