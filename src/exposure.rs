@@ -14,6 +14,8 @@ pub struct Frame {
     pub levels: u32,
     /// Whether the file holds colour more coarsely than brightness, as most JPEG files do (4:2:0, 4:2:2): no channel by itself is as sharp as their mean.
     pub chroma_subsampled: bool,
+    /// Whether the file format drops what is fine and faint, and noise with it (JPEG).
+    pub lossy: bool,
     /// Exposure time Δt in seconds.
     pub exposure_time: f64,
 }

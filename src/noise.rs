@@ -113,19 +113,21 @@ const FLATTEST: Quantile = Quantile { at: 0.05, of_noise: 0.554 };
 /// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes; blocks of all frames and
 /// channels are pooled, since shot and read noise depend on the exposure alone; blurred frames contribute most, as blur
 /// removes texture but not noise. Where two frames show the same scene in the same place, their difference has no texture left; where they
-/// do not, it has more, and texture never lowers a variance. Samples that others at a like exposure undercut are left out: where bright parts are
-/// all texture and dark ones black, few blocks tell the noise. Falls back to a full well of 10 000 e⁻ and read noise of 5 e⁻ when no block is
-/// usable.
+/// do not, it has more, and texture never lowers a variance. Samples that others at a like exposure undercut are left out, where
+/// no file format may have smoothed these: where bright parts are all texture and dark ones black, few blocks tell the noise. Falls back to a full well
+/// of 10 000 e⁻ and read noise of 5 e⁻ when no block is usable.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
     let at_lag = |lag| {
         let samples = samples(frames, exposures, response, lag);
-        fit(&untextured(&samples, &fit(&samples, BELOW)?), BELOW)
+        let many: Vec<Sample> = samples.iter().filter(|s| s.blocks >= MANY as f64).copied().collect();
+        fit(&many, BELOW).map(|model| (samples, model))
     };
     match (at_lag(1), at_lag(COARSE_LAG)) {
         // White noise reads the same at both lags, texture only lifts the coarse one a little.
-        (Some(fine), Some(coarse)) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
-        (Some(fine), _) => fine,
-        (None, Some(coarse)) => coarse,
+        (Some((_, fine)), Some((_, coarse))) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
+        (Some((samples, fine)), _) if !frames.iter().any(|f| f.lossy) => fit(&untextured(&samples, &fine), BELOW).unwrap_or(fine),
+        (Some((_, fine)), _) => fine,
+        (None, Some((_, coarse))) => coarse,
         (None, None) => NoiseModel::from_electrons(10_000.0, 5.0),
     }
 }
@@ -175,7 +177,7 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
             (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
         blocks.collect::<Vec<Sample>>()
     };
-    let of_frames = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST);
+    let of_frames = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST, FEWEST);
     let of_differences = pairs(frames, (0..frames.len()).collect()).into_iter().flat_map(|(i, j)| {
         let ratio = frames[i].exposure_time / frames[j].exposure_time;
         let differences = (0..3).into_par_iter().flat_map_iter(|c| {
@@ -183,7 +185,7 @@ fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize)
             let levels = frames[i].levels.min(frames[j].levels);
             collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels))
         });
-        bins(differences.collect(), &FLATTEST)
+        bins(differences.collect(), &FLATTEST, FEWEST)
     });
     of_frames.into_iter().chain(of_differences).collect()
 }
@@ -200,18 +202,19 @@ fn untextured(samples: &[Sample], model: &NoiseModel) -> Vec<Sample> {
     samples.iter().zip(&relative).filter(|(_, r)| !undercut(r)).map(|(s, _)| *s).collect()
 }
 
-/// Blocks that a bin has at least.
+/// Blocks that a bin has at least, for a level by itself and for one that is known roughly.
+const MANY: usize = 60;
 const FEWEST: usize = 30;
 
-/// Quantiles of bins of equal population along the exposure, none wider than a factor of 1.5.
-fn bins(mut blocks: Vec<Sample>, quantile: &Quantile) -> Vec<Sample> {
+/// Quantiles of bins of equal population along the exposure, of at least `fewest` blocks, none wider than a factor of 1.5.
+fn bins(mut blocks: Vec<Sample>, quantile: &Quantile, fewest: usize) -> Vec<Sample> {
     blocks.sort_by(|a, b| a.exposure.total_cmp(&b.exposure));
     let mut samples = Vec::new();
     let mut i = 0;
     while i < blocks.len() {
         let end = blocks[i..].partition_point(|b| b.exposure <= 1.5 * blocks[i].exposure) + i;
         let end = end.min(i + (blocks.len() / 40).max(200));
-        if end - i >= FEWEST {
+        if end - i >= fewest {
             let part = &blocks[i..end];
             let mut v: Vec<f64> = part.iter().map(|b| b.variance).collect();
             v.sort_by(f64::total_cmp);

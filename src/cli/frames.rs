@@ -170,6 +170,7 @@ pub(super) fn load(paths: &[PathBuf], given: Option<Vec<f64>>, white: f32) -> cr
             intensity: input.intensity,
             levels: input.levels,
             chroma_subsampled: input.chroma_subsampled,
+            lossy: input.lossy,
             exposure_time,
         });
         to_xyz.push(input.to_xyz);

@@ -29,6 +29,8 @@ pub struct Input {
     pub levels: u32,
     /// See [`crate::exposure::Frame::chroma_subsampled`].
     pub chroma_subsampled: bool,
+    /// See [`crate::exposure::Frame::lossy`].
+    pub lossy: bool,
     /// How intensity follows from light.
     pub encoding: Encoding,
     /// Linear RGB of this frame to XYZ relative to D50, white balance included.
@@ -99,6 +101,7 @@ pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
             intensity: raw.intensity,
             levels: 65535,
             chroma_subsampled: false,
+            lossy: false,
             encoding: Encoding::Linear,
             to_xyz: raw.to_xyz,
             metadata: raw.metadata,
@@ -128,6 +131,7 @@ pub fn decode(path: &Path, bytes: Vec<u8>, white: f32) -> Result<Input> {
         intensity: picture.intensity,
         levels: picture.levels,
         chroma_subsampled: picture.chroma_subsampled,
+        lossy: picture.lossy,
         encoding,
         to_xyz,
         metadata,
@@ -181,7 +185,16 @@ fn linear(path: &Path, image: Rgb, white: f32, to_xyz: Matrix, metadata: Metadat
         }
     }
     let intensity = image.map_planes(|p| p.map(|v| (v / white).clamp(0.0, 1.0)));
-    Ok(Input { intensity, levels: ldr::FLOAT_LEVELS, chroma_subsampled: false, encoding: Encoding::Linear, to_xyz, metadata, raw: false })
+    Ok(Input {
+        intensity,
+        levels: ldr::FLOAT_LEVELS,
+        chroma_subsampled: false,
+        lossy: false,
+        encoding: Encoding::Linear,
+        to_xyz,
+        metadata,
+        raw: false,
+    })
 }
 
 /// Pixels of a Radiance HDR file, and their RGB to XYZ relative to D50: by its PRIMARIES, without them Rec. 709, which is what programs

@@ -18,6 +18,8 @@ pub struct Picture {
     pub levels: u32,
     /// Whether the file holds colour more coarsely than brightness (JPEG).
     pub chroma_subsampled: bool,
+    /// See [`crate::exposure::Frame::lossy`].
+    pub lossy: bool,
     /// Whether the file holds floating-point numbers: those are linear, and may be above 1.
     pub float: bool,
     /// The ICC profile that the file embeds.
@@ -55,6 +57,7 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
     if jpeg.as_ref().is_some_and(|segments| segments.iter().all(|s| s.0 != END_OF_IMAGE)) {
         return Err(format("is truncated; copy it again from the camera".into()));
     }
+    let lossy = jpeg.is_some();
     let chroma_subsampled = jpeg.is_some_and(|segments| is_subsampled(&segments));
     let mut decoder = reader.into_decoder().map_err(|e| format(reason(&e)))?;
     let (width, height) = decoder.dimensions();
@@ -74,15 +77,15 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
     match &picture {
         DynamicImage::ImageLuma8(_) | DynamicImage::ImageLumaA8(_) | DynamicImage::ImageRgb8(_) | DynamicImage::ImageRgba8(_) => {
             let raw = picture.into_rgb8().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255, chroma_subsampled, float: false, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 255.0), levels: 255, chroma_subsampled, lossy, float: false, icc })
         }
         DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) | DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => {
             let raw = picture.into_rgb16().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535, chroma_subsampled, float: false, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 65535.0), levels: 65535, chroma_subsampled, lossy, float: false, icc })
         }
         _ => {
             let raw = picture.into_rgb32f().into_raw();
-            Ok(Picture { intensity: planes(&raw, width, height, 1.0), levels: FLOAT_LEVELS, chroma_subsampled, float: true, icc })
+            Ok(Picture { intensity: planes(&raw, width, height, 1.0), levels: FLOAT_LEVELS, chroma_subsampled, lossy, float: true, icc })
         }
     }
 }

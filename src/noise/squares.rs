@@ -1,7 +1,7 @@
 //! The noise level by the means of squares, for files whose format has made the noise smooth: JPEG drops what is finest within squares of 8 × 8
 //! pixels, here more and there less, and keeps their means.
 
-use super::{NoiseModel, Quantile, Sample, bins, clear, fit, pairs, quantisation, rounding};
+use super::{MANY, NoiseModel, Quantile, Sample, bins, clear, fit, pairs, quantisation, rounding};
 use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::response::Response;
@@ -20,7 +20,7 @@ const SMOOTHED: f64 = 1.5;
 /// The noise level of the frames `ids`, which show the same in the same place, if they have clearly more noise than `model` says: from the differences
 /// between each and the next longer one, averaged over squares, from one square to the next. `None` where `model` does well or too little is unclipped.
 pub fn of_squares(frames: &[Frame], exposures: &[Rgb], response: &Response, ids: &[usize], model: &NoiseModel) -> Option<NoiseModel> {
-    let of_pair = |(i, j)| bins(differences(frames, exposures, response, i, j), &MIDDLE);
+    let of_pair = |(i, j)| bins(differences(frames, exposures, response, i, j), &MIDDLE, MANY);
     let samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
     let (mut excess, mut count) = (0.0, 0.0);
     for s in &samples {

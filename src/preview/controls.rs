@@ -316,7 +316,14 @@ fn masks_at(frames: &[Frame], sharp: &[bool], alpha: f32, pixel: usize) -> Vec<f
     let one = |f: &Frame| {
         let z = f.intensity.pixel(pixel);
         let intensity = Rgb(std::array::from_fn(|c| Plane { width: 1, height: 1, data: vec![z[c]] }));
-        Frame { name: String::new(), intensity, levels: f.levels, chroma_subsampled: f.chroma_subsampled, exposure_time: f.exposure_time }
+        Frame {
+            name: String::new(),
+            intensity,
+            levels: f.levels,
+            chroma_subsampled: f.chroma_subsampled,
+            lossy: f.lossy,
+            exposure_time: f.exposure_time,
+        }
     };
     let ones: Vec<Frame> = frames.iter().map(one).collect();
     let still = vec![glam::DMat3::IDENTITY; ones.len()];

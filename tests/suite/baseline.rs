@@ -15,6 +15,7 @@ fn bracket(levels: [f32; 3]) -> Bracket {
         intensity: Rgb::filled(3, 2, level),
         levels: 255,
         chroma_subsampled: false,
+        lossy: false,
         exposure_time,
     };
     Bracket::new(levels.into_iter().zip([0.1, 1.0, 4.0]).map(frame).collect()).unwrap()

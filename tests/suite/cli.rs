@@ -504,7 +504,14 @@ fn office_is_calibrated_and_merged() {
     let seconds = [1.0 / 30.0, 0.1, 1.0 / 3.0, 0.625, 1.3, 4.0];
     let frames = names.iter().zip(seconds).map(|(name, exposure_time)| {
         let p = unshaken::io::ldr::read(&dir.path().join(name)).unwrap();
-        Frame { name: name.clone(), intensity: p.intensity, levels: p.levels, chroma_subsampled: p.chroma_subsampled, exposure_time }
+        Frame {
+            name: name.clone(),
+            intensity: p.intensity,
+            levels: p.levels,
+            chroma_subsampled: p.chroma_subsampled,
+            lossy: p.lossy,
+            exposure_time,
+        }
     });
     let plain = baseline::merge(&Bracket::new(frames.collect()).unwrap(), &response, &[0, 1, 2, 3, 4, 5]);
     let (image, factor) = exr::read(&dir.path().join("o.exr")).unwrap();

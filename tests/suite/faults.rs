@@ -299,6 +299,7 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
             intensity: picture.intensity,
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
+            lossy: picture.lossy,
             exposure_time,
         }
     };

@@ -59,6 +59,7 @@ fn photographed(
             intensity: Rgb(std::array::from_fn(plane)),
             levels: 4095,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time: TIMES[i],
         }
     };
@@ -207,6 +208,7 @@ fn frames_of_any_size_are_compared() {
             intensity: Rgb::filled(w, h, (0.3 * exposure_time) as f32),
             levels: 255,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         };
         let frames = [frame(1.0), frame(2.0)];

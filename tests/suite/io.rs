@@ -121,7 +121,11 @@ fn a_jpeg_that_holds_colour_coarsely_is_told() {
     // SOF0 of a picture of 8 x 8 pixels with components of 2 x 2, 1 x 1 and 1 x 1 samples.
     let header = [0xFF, 0xC0, 0, 17, 8, 0, 8, 0, 8, 3, 1, 0x22, 0, 2, 0x11, 1, 3, 0x11, 1];
     with_exif(&path, &picture, &[(exif::Tag::ImageDescription, exif::Value::Ascii(vec![header.to_vec()]))]);
-    assert!(!ldr::read(&path).unwrap().chroma_subsampled, "4:4:4");
+    let read = ldr::read(&path).unwrap();
+    assert!(!read.chroma_subsampled, "4:4:4");
+    let png = dir.path().join("a.png");
+    picture.save(&png).unwrap();
+    assert!(read.lossy && !ldr::read(&png).unwrap().lossy, "JPEG drops what is fine, PNG nothing");
     let mut bytes = std::fs::read(&path).unwrap();
     let tail = |bytes: &[u8], marker: [u8; 2]| bytes.windows(2).rposition(|w| w == marker).unwrap();
     let at = tail(&bytes, [0xFF, 0xC0]);

@@ -719,6 +719,7 @@ fn layers_lie_on_the_pixels_of_the_result() {
                 intensity: Rgb([plane.clone(), plane.clone(), plane]),
                 levels: 65535,
                 chroma_subsampled: false,
+                lossy: false,
                 exposure_time: time,
             }
         };

@@ -241,6 +241,7 @@ fn real_frames_that_are_sharp_are_registered_and_pass_for_sharp() {
                 intensity: picture.intensity,
                 levels: picture.levels,
                 chroma_subsampled: picture.chroma_subsampled,
+                lossy: picture.lossy,
                 exposure_time,
             }
         };

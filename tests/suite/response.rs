@@ -42,6 +42,7 @@ fn office_agrees_with_opencv() {
             intensity: picture.intensity,
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
+            lossy: picture.lossy,
             exposure_time,
         }
     });
@@ -74,7 +75,7 @@ fn noisy_bracket(f: fn(f64) -> f64, width: usize, height: usize, full_well: f64,
             })
         };
         let intensity = Rgb([1.0, 0.7, 0.4].map(|gain| plane(gain, &mut noise)));
-        Frame { name: format!("{exposure_time:.3}"), intensity, levels: 255, chroma_subsampled: false, exposure_time }
+        Frame { name: format!("{exposure_time:.3}"), intensity, levels: 255, chroma_subsampled: false, lossy: false, exposure_time }
     });
     Bracket::new(frames.to_vec()).unwrap()
 }
@@ -129,6 +130,7 @@ fn frames_that_share_no_shades_are_refused() {
         intensity: Rgb::filled(32, 32, value),
         levels: 255,
         chroma_subsampled: false,
+        lossy: false,
         exposure_time,
     };
     let error = calibrate(&Bracket::new(vec![frame(0.0, 0.001), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
@@ -270,6 +272,7 @@ fn few_shades_give_a_gamma_and_say_so() {
             intensity: Rgb([plane.clone(), plane.clone(), plane]),
             levels: 255,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         }
     });
@@ -283,6 +286,7 @@ fn few_shades_give_a_gamma_and_say_so() {
         intensity: Rgb::filled(48, 48, value),
         levels: 255,
         chroma_subsampled: false,
+        lossy: false,
         exposure_time,
     };
     let error = automatic(&Bracket::new(vec![frame(0.0, 0.01), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
@@ -325,6 +329,7 @@ fn correct_real_brackets_raise_no_alarm() {
             intensity: picture.intensity,
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
+            lossy: picture.lossy,
             exposure_time,
         }
     });

@@ -47,6 +47,7 @@ fn the_noise_level_is_found_within_a_fifth() {
             intensity: Rgb([plane.clone(), plane.clone(), plane]),
             levels: 65535,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time: 1.0,
         };
         let exposure = noise::exposure(&frame, &Response::Linear);
@@ -77,6 +78,7 @@ fn texture_that_two_frames_share_is_no_noise() {
             intensity: Rgb([plane.clone(), plane.clone(), plane]),
             levels: 65535,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         }
     };
@@ -110,6 +112,7 @@ fn texture_that_most_blocks_show_is_no_noise() {
             intensity: Rgb([plane(0), plane(1), plane(2)]),
             levels: 65535,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         }
     };
@@ -143,7 +146,14 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
             picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
         }
         let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
-        Frame { name: "grey".into(), intensity: Rgb([plane(0), plane(1), plane(2)]), levels: 255, chroma_subsampled: false, exposure_time }
+        Frame {
+            name: "grey".into(),
+            intensity: Rgb([plane(0), plane(1), plane(2)]),
+            levels: 255,
+            chroma_subsampled: false,
+            lossy: quality.is_some(),
+            exposure_time,
+        }
     };
     for (quality, smoothed) in [(Some(75), true), (Some(90), true), (None, false)] {
         let frames = [frame(0.4, 500, quality), frame(1.0, 600, quality)];
@@ -170,6 +180,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         intensity: Rgb(rgb.map(|v| Plane::filled(1, 1, v))),
         levels: 255,
         chroma_subsampled: false,
+        lossy: false,
         exposure_time,
     };
     let one = |frames: &[Frame], sharp: &[bool]| {
@@ -197,7 +208,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
 fn what_is_clipped_in_some_channels_counts_by_the_grey_of_all() {
     let pixels = [[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 1.0, 0.5], [1.0; 3], [0.0; 3], [1.0, 0.99, 0.2]];
     let intensity = Rgb([0, 1, 2].map(|c| Plane { width: pixels.len(), height: 1, data: pixels.iter().map(|p| p[c]).collect() }));
-    let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, exposure_time: 1.0 };
+    let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, lossy: false, exposure_time: 1.0 };
     let mask = Plane { width: pixels.len(), height: 1, data: vec![0.8, 0.0, 0.0, 0.0, 0.0, 0.0] };
     let found = mask::with_partly_clipped(&mask, &frame, &mask::spoilt_channels(&frame), 0.3, |_| 0.5).data;
     // Greys of 0.65, 0.943 and 0.903: the first in the flat part of the window, the others 0.057 and 0.097 from its end.
@@ -213,8 +224,14 @@ fn subsampled_colour_is_spoilt_beside_clipped_pixels() {
     let (w, h) = (9, 8);
     let lamp = Plane::from_fn(w, h, |x, y| if (x, y) == (3, 1) { 1.0 } else { 0.4 });
     let intensity = Rgb([lamp, Plane::filled(w, h, 0.4), Plane::filled(w, h, 0.4)]);
-    let frame =
-        |chroma_subsampled| Frame { name: "one".into(), intensity: intensity.clone(), levels: 255, chroma_subsampled, exposure_time: 1.0 };
+    let frame = |chroma_subsampled| Frame {
+        name: "one".into(),
+        intensity: intensity.clone(),
+        levels: 255,
+        chroma_subsampled,
+        lossy: true,
+        exposure_time: 1.0,
+    };
     for (subsampled, reach) in [(false, 0), (true, 2)] {
         let found = mask::spoilt_channels(&frame(subsampled));
         for (p, red) in found[0].iter().enumerate() {
@@ -252,7 +269,14 @@ fn a_blur_is_looked_for_in_the_channels_that_tell_of_it() {
                     (e * exposure_time as f32).min(1.0)
                 })
             };
-            Frame { name: "tinted".into(), intensity: Rgb([0, 1, 2].map(plane)), levels: 65535, chroma_subsampled: false, exposure_time }
+            Frame {
+                name: "tinted".into(),
+                intensity: Rgb([0, 1, 2].map(plane)),
+                levels: 65535,
+                chroma_subsampled: false,
+                lossy: false,
+                exposure_time,
+            }
         };
         times.map(frame).to_vec()
     };
@@ -396,6 +420,7 @@ fn a_frame_that_none_can_be_compared_with_is_not_taken_for_sharp() {
             intensity: Rgb([plane.clone(), plane.clone(), plane]),
             levels: 65535,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         }
     };
@@ -444,6 +469,7 @@ fn codes_of_a_dark_frame_and_noise_of_all_channels_alike_are_no_fine_structure()
             intensity: Rgb([plane.clone(), plane.clone(), plane]),
             levels: 255,
             chroma_subsampled: false,
+            lossy: false,
             exposure_time,
         }
     };
@@ -503,7 +529,7 @@ fn edges_are_even_behind_a_soft_lens_and_uneven_after_a_motion() {
     let moved = [(1, 0), (0, 1), (1, 1), (1, -1)].map(|(dx, dy)| mean(&scene, &along(dx, dy, 1)));
     let of = |plane: &Plane| {
         let intensity = Rgb([plane.clone(), plane.clone(), plane.clone()]);
-        let frame = Frame { name: String::new(), intensity, levels: 65535, chroma_subsampled: false, exposure_time: 1.0 };
+        let frame = Frame { name: String::new(), intensity, levels: 65535, chroma_subsampled: false, lossy: false, exposure_time: 1.0 };
         let exposures = [noise::exposure(&frame, &Response::Linear)];
         let frames = [frame];
         let found =
