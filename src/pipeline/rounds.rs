@@ -1,7 +1,7 @@
 //! Irradiance and blurs in turn, from the sharp frames on.
 
 use super::blind::SetFree;
-use super::shaken::{SLIGHT, UNEXPLAINED, for_estimates, for_first_round};
+use super::shaken::{LONG, SLIGHT, UNEXPLAINED, for_estimates, for_first_round};
 use super::{Estimate, Event, Outcome, Run};
 use crate::deblur::{self, Observation, Solution};
 use crate::error::{Error, Result};
@@ -14,9 +14,6 @@ use serde_json::Value;
 
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
-/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
-/// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
-const LONG: f64 = 12.0;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
 /// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
@@ -92,7 +89,7 @@ impl Run<'_> {
         if may_have_moved
             && bracket.base.is_some()
             && !unexplained
-            && bracket.still.len() + bracket.shaken.len() > 1
+            && bracket.all().len() > 1
             && let Some(stood) = self.ask_sharp_frames(&mut bracket)?
         {
             // Once more from these alone, without what was found beside the others.
@@ -280,8 +277,8 @@ impl Run<'_> {
         // TSFs that were given took no time.
         let begun = if estimated.is_empty() { 0.0 } else { 0.40 };
         while round < rounds && !bracket.shaken.is_empty() {
+            let all = bracket.all();
             let Known { given, reference, still, shaken, slight, tsfs, details, latent, base, reduced, .. } = &mut *bracket;
-            let all: Vec<usize> = still.iter().chain(&*shaken).copied().collect();
             let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;

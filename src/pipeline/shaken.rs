@@ -25,6 +25,9 @@ const LEAST_SQUARE: usize = 8;
 const FEWEST_SQUARES: usize = 6;
 /// Where a frame's blur leaves far more than noise, it must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
 pub(super) const UNEXPLAINED: f64 = 0.25;
+/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
+/// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
+pub(super) const LONG: f64 = 12.0;
 /// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
 pub(super) const SLIGHT: f64 = 4.0;
 /// Outer iterations of the rounds before the last.
