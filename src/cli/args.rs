@@ -308,8 +308,9 @@ pub(super) struct CalibrateArgs {
     /// Exposure times in seconds in the order of the frames, such as 1/30,1/8,0.2 [default: from EXIF]
     #[arg(long, value_name = "T,T,...", allow_hyphen_values = true)]
     pub exposures: Option<String>,
-    /// How: debevec (a table, all exposure times believed) or mitsunaga (a polynomial, exposure times refined)
-    #[arg(long, value_name = "NAME", value_enum, default_value_t = Method::Debevec)]
+    /// How: blocks (a smooth curve through the means of blocks), debevec (a table from single pixels) or mitsunaga (a polynomial, exposure
+    /// times refined)
+    #[arg(long, value_name = "NAME", value_enum, default_value_t = Method::Blocks)]
     pub method: Method,
     /// Replace an output that exists
     #[arg(long)]
@@ -323,6 +324,7 @@ const CALIBRATE_EXAMPLES: &str = "Examples:
 /// How a response is calibrated.
 #[derive(Clone, Copy, Debug, PartialEq, ValueEnum)]
 pub(super) enum Method {
+    Blocks,
     Debevec,
     Mitsunaga,
 }

@@ -18,11 +18,17 @@ pub(super) fn run(args: &CalibrateArgs) -> anyhow::Result<()> {
     let bracket = frames::read(&args.frames, times)?;
     progress.at("calibrating", 0.4);
     let given: Vec<f64> = bracket.frames().iter().map(|f| f.exposure_time).collect();
+    let debevec = || {
+        let method = "Debevec and Malik 1997, per channel, all pixels, ends extrapolated".to_owned();
+        anyhow::Ok((response::calibrate(&bracket)?, method, given.clone()))
+    };
     let (response, method, exposure_times) = match args.method {
-        Method::Debevec => {
-            let method = "Debevec and Malik 1997, per channel, all pixels, ends extrapolated".to_owned();
-            (response::calibrate(&bracket)?, method, given.clone())
-        }
+        Method::Blocks => match response::of_still_frames(&bracket) {
+            Ok(found) if found.poor.is_none() => (found.response, found.method, given.clone()),
+            // Too few shades for blocks: single pixels show more.
+            _ => debevec()?,
+        },
+        Method::Debevec => debevec()?,
         Method::Mitsunaga => {
             let found = response::mitsunaga(&bracket)?;
             let method = format!("Mitsunaga and Nayar 1999, polynomials of degree {}, exposure times refined", found.degree);

@@ -3,7 +3,7 @@
 use super::Response;
 use super::calibrate::make_monotone;
 use super::displacement::displacements;
-use super::shades::{self, Shade};
+use super::shades::{self, Motion, Shade};
 use crate::error::{Error, Result};
 use crate::exposure::Bracket;
 use nalgebra::{Cholesky, DMatrix, DVector};
@@ -50,7 +50,7 @@ const ENOUGH_FOR_CURVE: usize = 120;
 const MOST_POWERS: usize = 5;
 /// A curve with more unknowns must lower the held-out residual by this part.
 const WORTH_IT: f64 = 0.02;
-/// Three curves instead of one must lower it by this part: few blocks are of a strong colour.
+/// Three curves instead of one must lower it by this part: few blocks are of a strong colour. (Where nothing moved there are many: [`WORTH_IT`].)
 const WORTH_THREE: f64 = 0.1;
 /// Prior of the unknowns of ln f⁻¹: exponent 2.2 ± 2, coefficients 0 ± 4. Only directions that no shade determines feel it.
 const PRIOR: (f64, f64, f64) = (2.2, 2.0, 4.0);
@@ -83,6 +83,19 @@ const HELD: f64 = 1e-5;
 /// [`Error::Bracket`] when fewer than 12 blocks are well exposed in two frames of different exposure time, or no exponent from 0.4 to 6 explains
 /// them.
 pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
+    estimated(bracket, &Motion::Shaken(displacements(bracket.frames())))
+}
+
+/// The same from frames that show one scene without motion or blur, as a tripod gives them. Blocks down to 4 px count, beside clipped ones and beside
+/// edges as well: there are more shades, and nearer to white. What is not a power law in the deepest shadows (sRGB below code 20) is not seen.
+///
+/// # Errors
+/// Those of [`automatic`].
+pub fn of_still_frames(bracket: &Bracket) -> Result<Automatic> {
+    estimated(bracket, &Motion::None)
+}
+
+fn estimated(bracket: &Bracket, motion: &Motion) -> Result<Automatic> {
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
     let refuse = |why: String| {
@@ -91,24 +104,24 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
             frames[0].name
         ))
     };
-    let displaced = displacements(frames);
     let mut curves = Curves::gamma(2.2);
     let mut chosen = None;
     // Means of exposures need the curve: begin with a gamma, then with the curve itself.
     for _ in 0..2 {
-        let shades = shades::collect(frames, &displaced, &|c, z| curves.inverse(c, z));
+        let shades = shades::collect(frames, motion, &|c, z| curves.inverse(c, z));
         let telling = shades.iter().filter(|s| tells_ratio(s, &times)).count();
         if telling < FEWEST {
             return Err(refuse(format!("only {telling} of their blocks are well exposed in two frames of different exposure time")));
         }
         let problem = Problem { shades: &shades, times: &times, held: true };
-        let shape = if telling < ENOUGH_FOR_CURVE { Shape { powers: 0, shared: true } } else { problem.choose() };
+        let worth_three = if matches!(motion, Motion::None) { WORTH_IT } else { WORTH_THREE };
+        let shape = if telling < ENOUGH_FOR_CURVE { Shape { powers: 0, shared: true } } else { problem.choose(worth_three) };
         let fit = problem.believable(shape).ok_or_else(|| refuse("no curve that a camera could have explains them".into()))?;
         curves = fit.curves.clone();
         chosen = Some((fit, telling));
     }
     let (fit, telling) = chosen.expect("two rounds ran");
-    let shades = shades::collect(frames, &displaced, &|c, z| curves.inverse(c, z));
+    let shades = shades::collect(frames, motion, &|c, z| curves.inverse(c, z));
     let exposures = Problem { shades: &shades, times: &times, held: false }.check(fit.curves.shape, None);
     // With times that are wrong, the curve that held to them is wrong too.
     let fit = if exposures.suspects().is_empty() {
@@ -138,7 +151,7 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
 pub fn check_exposures(bracket: &Bracket, response: &Response) -> ExposureCheck {
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
-    let shades = shades::collect(frames, &displacements(frames), &|c, z| response.inverse(c, z));
+    let shades = shades::collect(frames, &Motion::Shaken(displacements(frames)), &|c, z| response.inverse(c, z));
     Problem { shades: &shades, times: &times, held: false }.check(Shape { powers: 0, shared: true }, Some(response))
 }
 
@@ -256,8 +269,8 @@ struct Problem<'a> {
 }
 
 impl Problem<'_> {
-    /// The simplest shape whose held-out residual is near the least.
-    fn choose(&self) -> Shape {
+    /// The simplest shape whose held-out residual is near the least; three curves instead of one must lower it by the part `worth_three`.
+    fn choose(&self, worth_three: f64) -> Shape {
         let score = |shape: Shape| -> f64 {
             let folds = [0, 1].map(|fold| {
                 let kept = |s: &Shade| (s.block.0 / 4 + s.block.1 / 4) % 2 == fold;
@@ -274,7 +287,7 @@ impl Problem<'_> {
             }
         }
         let apart = Shape { shared: false, ..best.1 };
-        if score(apart) < (1.0 - WORTH_THREE) * best.0 {
+        if score(apart) < (1.0 - worth_three) * best.0 {
             best.1 = apart;
         }
         best.1

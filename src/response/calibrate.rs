@@ -23,7 +23,7 @@ const LEAST_RISE: f64 = 0.001;
 const ANCHOR: usize = 128;
 
 /// Response f of the camera that took `bracket`, as a table of f⁻¹ at the intensities 0/255, ..., 255/255 per channel.
-/// The frames must show one scene without motion or blur.
+/// The frames must show one scene without motion or blur. ([`of_still_frames`](super::of_still_frames) has less of their noise.)
 ///
 /// Per channel, g = ln f⁻¹ minimises
 ///

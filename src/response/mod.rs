@@ -8,7 +8,7 @@ mod mitsunaga;
 mod reduce;
 mod shades;
 
-pub use automatic::{Automatic, DISAGREEMENT_EV, ExposureCheck, automatic, check_exposures};
+pub use automatic::{Automatic, DISAGREEMENT_EV, ExposureCheck, automatic, check_exposures, of_still_frames};
 pub use calibrate::calibrate;
 pub use file::{InverseTables, Provenance, ResponseFile};
 pub use mitsunaga::{Polynomial, mitsunaga};

@@ -8,8 +8,9 @@ use std::collections::HashMap;
 /// A frame's longer side holds so many blocks: 8 px of a frame of 360 px, 62 px of one of 2816 px, as blur in pixels grows with a
 /// frame's resolution.
 const BLOCKS: usize = 45;
-/// A block has at least so many pixels a side, for its mean to be less noisy than a pixel.
+/// A block has at least so many pixels a side, for its mean to be less noisy than a pixel and for blur not to reach across it; where nothing moved, so many.
 const LEAST_SIDE: usize = 8;
+const LEAST_STILL: usize = 4;
 /// Of large frames every so-manyth pixel is looked at, that a row has about so many.
 const SAMPLED: usize = 1000;
 /// A block of which more than this part reads zero hides its mean: noise is cut off at black.
@@ -26,6 +27,14 @@ const CROWD: f64 = 20.0;
 const KEPT: usize = 12;
 /// Standard deviation of the mean intensity of a block in which nothing moves (noise, compression): one code and a half of 255.
 const STILL: f64 = 1.5 / 255.0;
+
+/// What differs from frame to frame beside the exposure.
+pub(super) enum Motion {
+    /// Nothing: the frames show one scene in one place, unblurred.
+    None,
+    /// Blur, and where the scene lies: the frames' [`displacements`](super::displacement::displacements), where blocks are compared.
+    Shaken(Vec<(isize, isize)>),
+}
 
 /// One channel of one block in the frames that show it well.
 pub(super) struct Shade {
@@ -51,17 +60,16 @@ pub(super) struct Seen {
 
 /// Blocks of `frames` that at least two frames show neither clipped nor black, averaged in exposures under f⁻¹ = `inverse`(channel, z).
 ///
-/// `displaced`: the frames' [`displacements`](super::displacement::displacements), where blocks are compared.
-///
 /// Blur averages exposures; so a block's mean *exposure* survives it where the neighbouring blocks are as bright, whatever
-/// texture is inside. Where they are not, the difference to the neighbours becomes the uncertainty `Seen::deviation`.
-pub(super) fn collect(frames: &[Frame], displaced: &[(isize, isize)], inverse: &(dyn Fn(usize, f64) -> f64 + Sync)) -> Vec<Shade> {
+/// texture is inside. Where they are not, the difference to the neighbours becomes the uncertainty `Seen::deviation`, if there is `motion`.
+pub(super) fn collect(frames: &[Frame], motion: &Motion, inverse: &(dyn Fn(usize, f64) -> f64 + Sync)) -> Vec<Shade> {
     let Some(first) = frames.first() else { return Vec::new() };
     let (width, height) = first.intensity.size();
     let reach = (width.max(height) / BLOCKS).max(LEAST_SIDE);
+    let least = if matches!(motion, Motion::None) { LEAST_STILL } else { LEAST_SIDE };
     // Smaller blocks see smaller objects; blur moves as many pixels into them.
-    let sides = [reach, reach / 2, reach / 4].into_iter().filter(|&s| s == reach || s >= LEAST_SIDE);
-    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, displaced, inverse, side, reach)).collect();
+    let sides = [reach, reach / 2, reach / 4].into_iter().filter(|&s| s == reach || s >= least);
+    let mut shades: Vec<Shade> = sides.flat_map(|side| of_size(frames, motion, inverse, side, reach)).collect();
     let cell = |s: &Shade| (s.channel, s.seen.iter().map(|v| (v.frame, (v.z * CELLS) as usize)).collect::<Vec<_>>());
     let mut population: HashMap<_, usize> = HashMap::new();
     for s in &shades {
@@ -80,19 +88,13 @@ pub(super) fn collect(frames: &[Frame], displaced: &[(isize, isize)], inverse: &
     shades
 }
 
-/// [`collect`] of blocks of one size, without weights; each frame's are as far from their place as it is `displaced`, blur reaches over `reach` pixels.
-fn of_size(
-    frames: &[Frame],
-    displaced: &[(isize, isize)],
-    inverse: &(dyn Fn(usize, f64) -> f64 + Sync),
-    side: usize,
-    reach: usize,
-) -> Vec<Shade> {
+/// [`collect`] of blocks of one size, without weights; blur, if there is any, reaches over `reach` pixels.
+fn of_size(frames: &[Frame], motion: &Motion, inverse: &(dyn Fn(usize, f64) -> f64 + Sync), side: usize, reach: usize) -> Vec<Shade> {
     let (width, height) = frames[0].intensity.size();
     let (columns, rows) = (width / side, height / side);
     let jobs: Vec<(usize, usize)> = (0..3).flat_map(|c| (0..frames.len()).map(move |i| (c, i))).collect();
     let maps: Vec<Vec<Option<Seen>>> =
-        jobs.par_iter().map(|&(c, i)| means(&frames[i], i, displaced[i], c, side, reach, columns, rows, inverse)).collect();
+        jobs.par_iter().map(|&(c, i)| means(&frames[i], i, motion, c, side, reach, columns, rows, inverse)).collect();
     let mut shades = Vec::new();
     let mut maps = maps.into_iter();
     for channel in 0..3 {
@@ -110,7 +112,7 @@ fn of_size(
 fn means(
     frame: &Frame,
     index: usize,
-    (dx, dy): (isize, isize),
+    motion: &Motion,
     channel: usize,
     side: usize,
     reach: usize,
@@ -119,6 +121,10 @@ fn means(
     inverse: &(dyn Fn(usize, f64) -> f64 + Sync),
 ) -> Vec<Option<Seen>> {
     const STEPS: usize = 1020;
+    let ((dx, dy), blur) = match motion {
+        Motion::None => ((0, 0), 0),
+        Motion::Shaken(displaced) => (displaced[index], reach),
+    };
     let table: Vec<f64> = (0..=STEPS).map(|k| inverse(channel, k as f64 / STEPS as f64)).collect();
     let plane = &frame.intensity.0[channel];
     let stride = (plane.width.max(plane.height) / SAMPLED).max(1);
@@ -150,7 +156,7 @@ fn means(
             blocks.push(((k as f64 - 1.0 + part) / STEPS as f64, black as f64 > BLACK * n, white));
         }
     }
-    let around = reach.div_ceil(side);
+    let around = blur.div_ceil(side);
     let mut out = Vec::with_capacity(columns * rows);
     for by in 0..rows {
         for bx in 0..columns {
@@ -167,7 +173,7 @@ fn means(
                     }
                 }
             }
-            let moved = DISPLACEMENT * step * reach as f64 / side as f64;
+            let moved = DISPLACEMENT * step * blur as f64 / side as f64;
             out.push(usable.then(|| Seen { frame: index, z, deviation: STILL.hypot(moved) }));
         }
     }

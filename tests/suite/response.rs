@@ -4,7 +4,9 @@ use crate::support::files::{Noise, scene, shared};
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
 use unshaken::io::{ldr, metadata};
-use unshaken::response::{DISAGREEMENT_EV, Provenance, Response, ResponseFile, automatic, calibrate, check_exposures, mitsunaga};
+use unshaken::response::{
+    DISAGREEMENT_EV, Provenance, Response, ResponseFile, automatic, calibrate, check_exposures, mitsunaga, of_still_frames,
+};
 use unshaken::synth::{self, Camera, Tremor};
 
 /// ln f⁻¹ at the 256 codes, 0 at 128.
@@ -111,6 +113,26 @@ fn noisy_frames_give_back_the_curve_and_its_ends() {
                 // of magnitude (without the extrapolation they are off by 1.4 at code 3 and 0.9 at white).
                 assert!(worst[0] < limit && worst[1] < 0.35 && worst[2] < 0.7 && worst[3] < 0.08, "{seen}");
             }
+        }
+    }
+}
+
+/// Means of blocks have little noise, and a smooth curve goes through them: single pixels leave up to 12 % at the same noise (above).
+#[test]
+fn still_frames_give_back_the_curve_to_two_per_cent() {
+    let srgb = |x: f64| if x <= 0.0031308 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 };
+    // No power law is straight below code 10, as sRGB is.
+    for (name, f, limits) in [("film", film as fn(f64) -> f64, [0.02, 0.05, 0.05, 0.03]), ("srgb", srgb, [0.02, 0.2, 0.45, 0.04])] {
+        let found = of_still_frames(&noisy_bracket(f, 240, 180, 4000.0, 8.0)).unwrap();
+        assert!(found.poor.is_none(), "{:?}", found.poor);
+        assert_rises(&found.response);
+        let truth = true_ln_table(f);
+        for c in 0..3 {
+            let g = ln_table(&found.response, c);
+            let worst = [(20, 235), (10, 20), (5, 10), (236, 255)].map(|(a, b)| difference(&g, &truth, a, b));
+            let seen = format!("{name}, channel {c}: {worst:.3?} ({})", found.method);
+            println!("{seen}");
+            assert!(worst.iter().zip(limits).all(|(w, most)| *w < most), "{seen}");
         }
     }
 }
