@@ -228,6 +228,8 @@ const SEVERAL_SET_FREE: Shown = Shown { left: 0.86, unlike: 0.12 };
 /// [`Shown::left`] at most where files hold colour more coarsely than brightness: what JPEG takes from sharp frames differs from one to the next, and passes
 /// for a blur that leaves 0.87 and more.
 const LEFT_OF_JPEG: f64 = 0.80;
+/// [`Shown::unlike`] at least there, for the same reason: sharp frames of such files differ by up to 0.14.
+const UNLIKE_OF_JPEG: f64 = 0.2;
 /// [`blind::Freed::held_out`] at most, whatever the noise: what the frames do not agree about beyond is no motion.
 const AGREED: f64 = 300.0;
 /// The same times the variance of shot noise at white: aliasing leaves up to 9 at a full well of 4000 electrons, and as much more as there is less noise.
@@ -286,6 +288,12 @@ pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]
 /// Whether one of the frames `used` that passes for sharp has a little less fine structure than another: those that do not may have moved a little as well.
 pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
     used.iter().map(|&i| &verdicts[i]).any(|v| v.sharp && v.compared && v.detail < LESS_DETAILED)
+}
+
+/// What has to be shown where so `many` frames were taken for sharp; `coarse`: of files that hold colour more coarsely than brightness.
+fn to_be_shown(many: usize, coarse: bool) -> Shown {
+    let line = if many == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
+    if coarse { Shown { left: line.left.min(LEFT_OF_JPEG), unlike: line.unlike.max(UNLIKE_OF_JPEG) } } else { line }
 }
 
 /// What may be left of frames that agree about a motion, in units of the noise, whose shot noise has the variance `shot` at white.
@@ -753,12 +761,11 @@ impl Run<'_> {
             events(Event::Progress { stage, fraction: 0.38 + 0.02 * s.fraction })
         })
         .ok_or(Error::Cancelled)?;
-        let line = if places.len() == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
         let coarse = used.iter().any(|&i| self.bracket.frames()[i].chroma_subsampled);
-        let most = if coarse { line.left.min(LEFT_OF_JPEG) } else { line.left };
+        let line = to_be_shown(places.len(), coarse);
         let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
         let moved = longest > SHAKEN && longest < TOO_FAR;
-        let likely = moved && found.left < most && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
+        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
@@ -848,6 +855,18 @@ mod tests {
         assert!(!less_detailed(&all, &[0, 3]), "the other one does not pass for sharp");
         assert!(!less_detailed(&all, &[0]), "the other one is not in use");
         assert!(!less_detailed(&all, &[0, 2]), "nothing says that it is less fine than another");
+    }
+
+    #[test]
+    fn sharp_frames_of_files_with_coarse_colour_are_not_set_free() {
+        let frees = |left: f64, unlike: f64, coarse: bool| {
+            let line = to_be_shown(2, coarse);
+            left < line.left && unlike > line.unlike
+        };
+        // Two sharp JPEG frames each, of an office and of a still life.
+        assert!(!frees(0.76, 0.138, true) && !frees(0.78, 0.130, true));
+        assert!(frees(0.64, 0.37, true), "a slight blur in such files");
+        assert!(frees(0.76, 0.138, false), "and one in others");
     }
 
     #[test]
