@@ -7,6 +7,7 @@ use crate::deblur::{self, Observation, Solution};
 use crate::error::{Error, Result};
 use crate::ghosts;
 use crate::image::{Plane, Rgb};
+use crate::noise::NoiseModel;
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
 use glam::DMat3;
@@ -17,6 +18,36 @@ const ROUNDS: usize = 2;
 /// Outer iterations for the sharp frames alone. Where they are displaced they get as many as shaken ones: the start was resampled, which
 /// smooths, and the residual-driven weights come late.
 const SHARP_OUTER: usize = 3;
+
+/// How a frame that passed for shaken shows that it lay still.
+struct Lay {
+    /// Part of another frame's fine structure that it has, at least, if that can be told.
+    detail: f64,
+    /// How much worse it is explained by having lain still than by its blur, at most: mean logarithm of squared residuals.
+    worse: f64,
+    /// The same where its fine structure cannot be told.
+    uncompared: f64,
+}
+
+/// Whatever its blur explains. Sharp frames measure -0.04 to 0.007, one of 1.5 px 0.24.
+const AS_WELL: Lay = Lay { detail: 0.5, worse: 0.05, uncompared: 0.05 };
+/// Where its blur does not explain it. Displaced sharp frames that are softer than the reference measure 0.70 and 0.42, blurs of 4 px and more less than 0.5 and
+/// 1.3 and more.
+const NEARLY: Lay = Lay { detail: 0.6, worse: 0.8, uncompared: 0.1 };
+
+impl Lay {
+    /// Whether a frame of which `verdict` and `detail` tell lay still.
+    fn holds(&self, verdict: &Verdict, detail: &Value) -> bool {
+        let most = if !verdict.compared {
+            self.uncompared
+        } else if verdict.detail >= self.detail {
+            self.worse
+        } else {
+            return false;
+        };
+        detail["still_worse_by"].as_f64().is_some_and(|worse| worse < most)
+    }
+}
 
 /// A bracket of which it is known which frames are sharp.
 pub(super) struct Sorted {
@@ -67,6 +98,14 @@ impl Known {
     }
 }
 
+/// What came of [`Run::rounds`].
+enum Rounds {
+    /// The irradiance; `None` where no shaken frame is left.
+    Solved(Option<Box<Solution>>),
+    /// Frames that lay still after all.
+    Lay(Vec<usize>),
+}
+
 /// How the sharp frames alone (where none is, all) are solved for.
 struct SharpAlone {
     frames: Vec<usize>,
@@ -86,35 +125,24 @@ impl Run<'_> {
         let reference = self.laid_out(&sorted)?;
         let (mut bracket, sharp_alone) = self.sharp_frames(sorted, reference)?;
         self.estimate_blurs(&mut bracket)?;
+        let lay = |i: &usize| self.lay_still(&AS_WELL, &bracket.still, &bracket.verdicts[*i], &bracket.details[*i]);
+        let lay: Vec<usize> = bracket.estimated.iter().copied().filter(lay).collect();
+        if bracket.base.is_some() && !lay.is_empty() {
+            return self.laid_still(bracket, &lay, noise, may_have_moved);
+        }
         if may_have_moved
             && bracket.base.is_some()
             && !unexplained
             && bracket.all().len() > 1
             && let Some(stood) = self.ask_sharp_frames(&mut bracket)?
         {
-            // Once more from these alone, without what was found beside the others.
-            self.memo.depends(&stood);
-            self.take_noise(noise);
-            let used = bracket.all();
-            for &i in &used {
-                (bracket.sharp[i], bracket.tsfs[i]) = (stood.contains(&i), None);
-            }
-            let Known { verdicts, given, sharp, tsfs, .. } = bracket;
-            return self.deblurred(Sorted {
-                verdicts,
-                known: given,
-                used,
-                sharp,
-                tsfs,
-                scene: None,
-                centre: None,
-                reduced: false,
-                unexplained: false,
-                may_have_moved: false,
-            });
+            return self.once_more(bracket, &stood, noise, false);
         }
         let start = bracket.latent.clone();
-        let solution = self.rounds(&mut bracket, &start)?;
+        let solution = match self.rounds(&mut bracket, &start)? {
+            Rounds::Solved(found) => found.map(|found| *found),
+            Rounds::Lay(ids) => return self.laid_still(bracket, &ids, noise, false),
+        };
         if bracket.shaken.is_empty() && !unexplained {
             self.find_aliasing(&bracket.still, &bracket.shaken, &bracket.latent, 0.80, 0.90)?;
         }
@@ -140,6 +168,57 @@ impl Run<'_> {
         }
         let all = bracket.all();
         self.finish(solution, reference, &bracket.verdicts, &bracket.sharp, &all, &bracket.tsfs, bracket.details)
+    }
+
+    /// Whether a frame of which `verdict` and `detail` tell lay still, by `line`, beside the sharp frames `still`: one that registration has found, as no blur explains more
+    /// than none of another scene either.
+    fn lay_still(&self, line: &Lay, still: &[usize], verdict: &Verdict, detail: &Value) -> bool {
+        self.settings.align && !still.is_empty() && line.holds(verdict, detail)
+    }
+
+    /// The irradiance of a bracket of which the frames `ids` are sharp after all. Such a frame is placed by all of its pixels, a shaken one by the middle of its blur.
+    fn laid_still(mut self, mut bracket: Known, ids: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
+        for &i in ids {
+            bracket.sharp[i] = true;
+            bracket.verdicts[i].reason += ", but no camera shake explains more of it than none: it counts as it lies";
+        }
+        if self.settings.align {
+            let used = bracket.all();
+            let own = format!("{ids:?} {used:?}");
+            let found =
+                self.remembered("place", &own, |_| 0, |run| run.register_on(bracket.reference, &used, &bracket.sharp, &bracket.given))?;
+            for &i in ids.iter().filter(|&&i| found[i].registered) {
+                self.motions[i] = found[i].motion();
+                self.registrations[i] = found[i].clone();
+            }
+        }
+        let sharp = [bracket.still.as_slice(), ids].concat();
+        self.once_more(bracket, &sharp, noise, may_have_moved)
+    }
+
+    /// The irradiance of a bracket of which the frames `sharp` alone are sharp after all, without what was found beside the others. `noise`: its level before it
+    /// was measured by the frames that were taken for sharp.
+    fn once_more(mut self, bracket: Known, sharp: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
+        self.memo.depends(&sharp.to_vec());
+        self.take_noise(noise);
+        self.aliasing.fill(None);
+        let used = bracket.all();
+        let Known { verdicts, given, sharp: mut flags, mut tsfs, .. } = bracket;
+        for &i in used.iter().filter(|&&i| !given[i]) {
+            (flags[i], tsfs[i]) = (sharp.contains(&i), None);
+        }
+        self.deblurred(Sorted {
+            verdicts,
+            known: given,
+            used,
+            sharp: flags,
+            tsfs,
+            scene: None,
+            centre: None,
+            reduced: false,
+            unexplained: false,
+            may_have_moved,
+        })
     }
 
     /// Noise level, places, ghosts and masks of a bracket that is `sorted`; the reference frame.
@@ -265,8 +344,8 @@ impl Run<'_> {
     }
 
     /// Irradiance of all frames and their TSFs refined against it, in turn; frames that no blur explains are left out. `start`: irradiance before the
-    /// shaken frames counted. `None` where no shaken frame is left.
-    fn rounds(&mut self, bracket: &mut Known, start: &Rgb) -> Result<Option<Solution>> {
+    /// shaken frames counted.
+    fn rounds(&mut self, bracket: &mut Known, start: &Rgb) -> Result<Rounds> {
         let (w, h) = self.bracket.size();
         let mut solution = None;
         let estimated = if bracket.reduced { bracket.shaken.clone() } else { std::mem::take(&mut bracket.estimated) };
@@ -278,7 +357,7 @@ impl Run<'_> {
         let begun = if estimated.is_empty() { 0.0 } else { 0.40 };
         while round < rounds && !bracket.shaken.is_empty() {
             let all = bracket.all();
-            let Known { given, reference, still, shaken, slight, tsfs, details, latent, base, reduced, .. } = &mut *bracket;
+            let Known { verdicts, given, reference, still, shaken, slight, tsfs, details, latent, base, reduced, .. } = &mut *bracket;
             let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
@@ -334,6 +413,11 @@ impl Run<'_> {
             if self.look_for_slight(&ids, start, tsfs, details, at(1.0))? {
                 continue;
             }
+            let lay = |i: &usize| self.lay_still(&NEARLY, still, &verdicts[*i], &details[*i]);
+            let lay: Vec<usize> = hopeless.iter().map(|h| h.0).filter(lay).collect();
+            if !lay.is_empty() {
+                return Ok(Rounds::Lay(lay));
+            }
             // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
             for (i, chi) in hopeless {
                 let what = if given[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
@@ -341,7 +425,7 @@ impl Run<'_> {
                 shaken.retain(|&k| k != i);
             }
         }
-        Ok(solution)
+        Ok(Rounds::Solved(solution.map(Box::new)))
     }
 
     /// Solves for the frames `ids`; progress runs from `from` to `to`.
@@ -428,5 +512,36 @@ impl Run<'_> {
             self.aliasing[i] = found;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn a_frame_that_lay_still_shows_nearly_as_much_and_its_blur_explains_little() {
+        let of = |line: &Lay, detail: f64, compared: bool, worse: Value| {
+            let verdict = Verdict {
+                sharp: false,
+                detail,
+                compared,
+                linked: true,
+                steepness: 0.5,
+                evenness: 1.0,
+                alike: vec![],
+                reason: String::new(),
+            };
+            line.holds(&verdict, &json!({ "still_worse_by": worse }))
+        };
+        assert!(of(&NEARLY, 0.70, true, json!(0.42)), "sharp, displaced, a little softer than the reference");
+        assert!(!of(&AS_WELL, 0.70, true, json!(0.24)), "a blur of 1.5 px, if it explains its frame");
+        assert!(!of(&NEARLY, 0.44, true, json!(0.42)), "it lacks what another shows");
+        assert!(!of(&NEARLY, 0.70, true, json!(1.3)), "its blur explains far more, though not all");
+        assert!(of(&AS_WELL, 0.57, true, json!(0.002)), "its blur explains nothing");
+        assert!(!of(&NEARLY, 1.0, false, json!(0.42)), "nothing says how fine it is");
+        assert!(of(&AS_WELL, 1.0, false, json!(0.007)), "but its blur explains nothing");
+        assert!(!of(&AS_WELL, 0.70, true, Value::Null), "nothing was tried: the model was given");
     }
 }

@@ -165,6 +165,7 @@ impl Run<'_> {
             "focal_px": found.tsf.focal_px,
             "focal_length": found.focal,
             "models_tried": found.trials,
+            "still_worse_by": found.still_worse_by,
             "estimated_at_scale": found.scale,
             "extent_px": tsf::extent(&found.tsf, latent.width(), latent.height()),
             "residual": found.residual,
