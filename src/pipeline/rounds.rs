@@ -171,9 +171,9 @@ impl Run<'_> {
     }
 
     /// Whether a frame of which `verdict` and `detail` tell lay still, by `line`, beside the sharp frames `still`: one that registration has found, as no blur explains more
-    /// than none of another scene either.
+    /// than none of another scene either. Nobody asks where it was said which frames are sharp.
     fn lay_still(&self, line: &Lay, still: &[usize], verdict: &Verdict, detail: &Value) -> bool {
-        self.settings.align && !still.is_empty() && line.holds(verdict, detail)
+        self.settings.align && self.settings.sharp.is_none() && !still.is_empty() && line.holds(verdict, detail)
     }
 
     /// The irradiance of a bracket of which the frames `ids` are sharp after all. Such a frame is placed by all of its pixels, a shaken one by the middle of its blur.
@@ -182,15 +182,13 @@ impl Run<'_> {
             bracket.sharp[i] = true;
             bracket.verdicts[i].reason += ", but no camera shake explains more of it than none: it counts as it lies";
         }
-        if self.settings.align {
-            let used = bracket.all();
-            let own = format!("{ids:?} {used:?}");
-            let found =
-                self.remembered("place", &own, |_| 0, |run| run.register_on(bracket.reference, &used, &bracket.sharp, &bracket.given))?;
-            for &i in ids.iter().filter(|&&i| found[i].registered) {
-                self.motions[i] = found[i].motion();
-                self.registrations[i] = found[i].clone();
-            }
+        let used = bracket.all();
+        let own = format!("{ids:?} {used:?}");
+        let found =
+            self.remembered("place", &own, |_| 0, |run| run.register_on(bracket.reference, &used, &bracket.sharp, &bracket.given))?;
+        for &i in ids.iter().filter(|&&i| found[i].registered) {
+            self.motions[i] = found[i].motion();
+            self.registrations[i] = found[i].clone();
         }
         let sharp = [bracket.still.as_slice(), ids].concat();
         self.once_more(bracket, &sharp, noise, may_have_moved)

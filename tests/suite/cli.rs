@@ -625,11 +625,17 @@ fn a_frame_of_which_no_shake_explains_more_than_none_counts_as_it_lies() {
         ["synth", scene, "--size", "220", "--shaken", "none", "--shift", "12", "--full-well", "12000", "--seed", "16", "--output-dir", "b"];
     let merge = ["merge", "--response", "srgb", "--reference", "1", "-o", "o.exr", "--report", "o.json"];
     let frames = ["b/frame1.png", "b/frame2.png", "b/frame3.png"];
-    for arguments in [[&draw[..], &times].concat(), [&merge[..], &times, &frames].concat()] {
+    let call = |arguments: Vec<&str>| {
         let out = unshaken(dir.path(), &arguments);
         assert!(out.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&out.stderr));
-    }
-    let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(dir.path().join("o.json")).unwrap()).unwrap();
+    };
+    let report = || serde_json::from_str::<serde_json::Value>(&std::fs::read_to_string(dir.path().join("o.json")).unwrap()).unwrap();
+    call([&draw[..], &times].concat());
+    // Unless it was said that it is shaken.
+    call([&merge[..], &times, &["--sharp", "1", "--exclude", "3"], &frames].concat());
+    assert_eq!(report()["frames"][1]["sharp"], false);
+    call([&merge[..], &["--overwrite"], &times, &frames].concat());
+    let report = report();
     assert_eq!(report["left_out"], serde_json::json!([]));
     for frame in report["frames"].as_array().unwrap() {
         assert_eq!(frame["sharp"], true, "{}", frame["triage"]);
