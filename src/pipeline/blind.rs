@@ -176,6 +176,8 @@ const SURELY_STEEP: f64 = 0.60;
 /// Detail up to which a frame that passes for sharp may be blurred, though another frame is surely sharp: most sharp ones measure more. At night, where
 /// little but lamps can be seen, blurred ones may do so too.
 const SURELY_DETAILED: f64 = 0.85;
+/// Steepness below which a frame that passes for sharp may be blurred, if nothing says how fine its structure is and another frame has a surely steep edge.
+const SOFT: f64 = 0.45;
 /// How alike three frames or more are in their fine structure that stood still: sharp ones measure 0.92 and more in place and 0.77 and more displaced, two
 /// shaken ones that are in doubt up to 0.76.
 const ALIKE: f64 = 0.78;
@@ -281,7 +283,8 @@ fn chained(verdicts: &[Verdict], frames: &[usize]) -> f64 {
 /// of the next, and the trail of a lamp has steep edges of its own.
 pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> (Vec<usize>, Vec<usize>) {
     let passing = used.iter().copied().filter(|&i| sharp[i]);
-    let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| verdicts[i].compared && verdicts[i].detail < SURELY_DETAILED);
+    let little = |v: &Verdict| if v.compared { v.detail < SURELY_DETAILED } else { v.steepness < SOFT };
+    let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| little(&verdicts[i]));
     if sure.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
 }
 
@@ -845,6 +848,8 @@ mod tests {
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "trails of lamps have steep edges, too");
         all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
+        all[1] = Verdict { compared: false, ..verdict(1.0, 0.34, true) };
+        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "its edges are far softer than another's");
     }
 
     #[test]
