@@ -437,7 +437,7 @@ pub fn triage(
             v.reason = format!("fine structure {:.0} % of the best frame's, steepness {:.2}", 100.0 * v.detail, v.steepness);
         }
     }
-    // Deblurring a sharp frame loses next to nothing, taking a blurred one for sharp spoils the picture.
+    // Taking a blurred frame for sharp spoils the picture; that a sharp one has no blur to be undone shows later.
     let tells = |v: &Verdict| v.compared && v.linked;
     if given.is_none() && verdicts.iter().any(|v| v.sharp && tells(v)) {
         for v in verdicts.iter_mut().filter(|v| v.sharp && !tells(v)) {
