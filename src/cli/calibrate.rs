@@ -22,11 +22,16 @@ pub(super) fn run(args: &CalibrateArgs) -> anyhow::Result<()> {
         let method = "Debevec and Malik 1997, per channel, all pixels, ends extrapolated".to_owned();
         anyhow::Ok((response::calibrate(&bracket)?, method, given.clone()))
     };
+    // Without a response to compare with, only times that contradict each other are seen; frames that say nothing say so.
+    let (blocks, check) = match response::of_still_frames(&bracket) {
+        Ok(found) => (found.poor.is_none().then_some((found.response, found.method)), Some(found.exposures)),
+        Err(_) => (None, None),
+    };
     let (response, method, exposure_times) = match args.method {
-        Method::Blocks => match response::of_still_frames(&bracket) {
-            Ok(found) if found.poor.is_none() => (found.response, found.method, given.clone()),
+        Method::Blocks => match blocks {
+            Some((response, method)) => (response, method, given.clone()),
             // Too few shades for blocks: single pixels show more.
-            _ => debevec()?,
+            None => debevec()?,
         },
         Method::Debevec => debevec()?,
         Method::Mitsunaga => {
@@ -35,8 +40,6 @@ pub(super) fn run(args: &CalibrateArgs) -> anyhow::Result<()> {
             (found.response, method, found.exposure_times)
         }
     };
-    // Without a response to compare with, only times that contradict each other are seen; frames that say nothing say so.
-    let check = response::automatic(&bracket).ok().map(|a| a.exposures);
     if let Some(text) = check.and_then(|c| c.warning(&bracket)) {
         progress.warn(&text);
     }

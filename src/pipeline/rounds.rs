@@ -127,8 +127,8 @@ impl Run<'_> {
         self.estimate_blurs(&mut bracket)?;
         let lay = |i: &usize| self.lay_still(&AS_WELL, &bracket.still, &bracket.verdicts[*i], &bracket.details[*i]);
         let lay: Vec<usize> = bracket.estimated.iter().copied().filter(lay).collect();
-        if bracket.base.is_some() && !lay.is_empty() {
-            return self.laid_still(bracket, &lay, noise, may_have_moved);
+        if !lay.is_empty() {
+            return self.counted_as_sharp(bracket, &lay, noise, may_have_moved);
         }
         if may_have_moved
             && bracket.base.is_some()
@@ -141,7 +141,7 @@ impl Run<'_> {
         let start = bracket.latent.clone();
         let solution = match self.rounds(&mut bracket, &start)? {
             Rounds::Solved(found) => found.map(|found| *found),
-            Rounds::Lay(ids) => return self.laid_still(bracket, &ids, noise, false),
+            Rounds::Lay(ids) => return self.counted_as_sharp(bracket, &ids, noise, false),
         };
         if bracket.shaken.is_empty() && !unexplained {
             self.find_aliasing(&bracket.still, &bracket.shaken, &bracket.latent, 0.80, 0.90)?;
@@ -177,7 +177,7 @@ impl Run<'_> {
     }
 
     /// The irradiance of a bracket of which the frames `ids` are sharp after all. Such a frame is placed by all of its pixels, a shaken one by the middle of its blur.
-    fn laid_still(mut self, mut bracket: Known, ids: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
+    fn counted_as_sharp(mut self, mut bracket: Known, ids: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
         for &i in ids {
             bracket.sharp[i] = true;
             bracket.verdicts[i].reason += ", but no camera shake explains more of it than none: it counts as it lies";

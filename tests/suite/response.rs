@@ -64,6 +64,10 @@ fn film(x: f64) -> f64 {
     0.55 * g + 0.45 * (g * g * (3.0 - 2.0 * g))
 }
 
+fn srgb(x: f64) -> f64 {
+    if x <= 0.0031308 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 }
+}
+
 /// Three noisy 8-bit frames through `f`: shot noise of `full_well` electrons, read noise, cut off at black and white.
 fn noisy_bracket(f: fn(f64) -> f64, width: usize, height: usize, full_well: f64, read_noise: f64) -> Bracket {
     let mut noise = Noise::new(7);
@@ -98,7 +102,6 @@ fn true_ln_table(f: fn(f64) -> f64) -> Vec<f64> {
 
 #[test]
 fn noisy_frames_give_back_the_curve_and_its_ends() {
-    let srgb = |x: f64| if x <= 0.0031308 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 };
     for (name, f) in [("film", film as fn(f64) -> f64), ("srgb", srgb)] {
         for (full_well, read_noise, limit) in [(12000.0, 6.0, 0.06), (4000.0, 8.0, 0.12)] {
             let response = calibrate(&noisy_bracket(f, 240, 180, full_well, read_noise)).unwrap();
@@ -120,7 +123,6 @@ fn noisy_frames_give_back_the_curve_and_its_ends() {
 /// Means of blocks have little noise, and a smooth curve goes through them: single pixels leave up to 12 % at the same noise (above).
 #[test]
 fn still_frames_give_back_the_curve_to_two_per_cent() {
-    let srgb = |x: f64| if x <= 0.0031308 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 };
     // No power law is straight below code 10, as sRGB is.
     for (name, f, limits) in [("film", film as fn(f64) -> f64, [0.02, 0.05, 0.05, 0.03]), ("srgb", srgb, [0.02, 0.2, 0.45, 0.04])] {
         let found = of_still_frames(&noisy_bracket(f, 240, 180, 4000.0, 8.0)).unwrap();
