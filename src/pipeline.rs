@@ -363,22 +363,16 @@ impl Run<'_> {
     /// Registers the frames against each other, leaves out those that cannot be, and looks again which are sharp, pixel by pixel of the
     /// scene. `known`: frames whose place the user gave.
     fn align(&mut self, mut verdicts: Vec<Verdict>, excluded: &mut [bool], known: &[bool]) -> Result<Vec<Verdict>> {
-        let frames = self.bracket.frames();
-        let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
+        let used: Vec<usize> = (0..excluded.len()).filter(|&i| !excluded[i]).collect();
         let sharp: Vec<bool> = verdicts.iter().map(|v| v.sharp).collect();
-        let still: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
-        let first = self.settings.reference.or_else(|| self.bracket.longest(&still)).or_else(|| self.bracket.shortest(&used)).unwrap_or(0);
-        let mut found = self.register_on(first, &used, &sharp, known)?;
-        // If most do not fit the first reference, it may be the one that is not of the scene.
-        let misfits = |r: &[Registration]| used.iter().filter(|&&i| !r[i].registered).count();
-        if self.settings.reference.is_none() && used.len() > 2 && 2 * misfits(&found) >= used.len() {
-            let rest: Vec<usize> = used.iter().copied().filter(|&i| i != first).collect();
-            let still: Vec<usize> = rest.iter().copied().filter(|&i| sharp[i]).collect();
-            if let Some(second) = self.bracket.longest(&still).or_else(|| self.bracket.shortest(&rest)) {
-                let other = self.register_on(second, &used, &sharp, known)?;
-                if misfits(&other) < misfits(&found) {
-                    found = other;
-                }
+        let mut found = self.registered(&used, &sharp, known)?;
+        if let Some(again) = self.triaged_in_place(&found, &used, excluded) {
+            let now: Vec<bool> = again.iter().zip(&found).map(|(v, r)| v.sharp && r.registered).collect();
+            verdicts = again;
+            // Frames that lie elsewhere pass for shaken; now that they show to be sharp, they are placed as such, and show more of the scene to the others.
+            if used.iter().any(|&i| now[i] && !sharp[i]) {
+                found = self.registered(&used, &now, known)?;
+                verdicts = self.triaged_in_place(&found, &used, excluded).unwrap_or(verdicts);
             }
         }
         for &i in &used {
@@ -389,12 +383,41 @@ impl Run<'_> {
         }
         self.motions = found.iter().map(Registration::motion).collect();
         self.registrations = found;
-        let moved = self.motions.iter().any(|m| *m != DMat3::IDENTITY);
-        if moved || !self.left_out.is_empty() {
-            let given = self.settings.sharp.as_deref();
-            verdicts = triage::triage(frames, &self.exposures, &self.curves, excluded, given, &self.motions);
-        }
         Ok(verdicts)
+    }
+
+    /// Which of the frames `used` are sharp where they lie, those that could not be registered left out; `None` where none moved: it is known.
+    fn triaged_in_place(&self, found: &[Registration], used: &[usize], excluded: &[bool]) -> Option<Vec<Verdict>> {
+        let mut excluded = excluded.to_vec();
+        for &i in used {
+            excluded[i] |= !found[i].registered;
+        }
+        let motions: Vec<DMat3> = found.iter().map(Registration::motion).collect();
+        let moved = motions.iter().any(|m| *m != DMat3::IDENTITY) || used.iter().any(|&i| excluded[i]);
+        let given = self.settings.sharp.as_deref();
+        moved.then(|| triage::triage(self.bracket.frames(), &self.exposures, &self.curves, &excluded, given, &motions))
+    }
+
+    /// Where the frames `used` lie, by the longest of those that are `sharp` or, if most do not fit that, by the next.
+    fn registered(&mut self, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
+        let best = |run: &Self, of: &[usize]| {
+            let still: Vec<usize> = of.iter().copied().filter(|&i| sharp[i]).collect();
+            run.bracket.longest(&still).or_else(|| run.bracket.shortest(of))
+        };
+        let first = self.settings.reference.or_else(|| best(self, used)).unwrap_or(0);
+        let found = self.register_on(first, used, sharp, known)?;
+        // If most do not fit the first reference, it may be the one that is not of the scene.
+        let misfits = |r: &[Registration]| used.iter().filter(|&&i| !r[i].registered).count();
+        if self.settings.reference.is_none() && used.len() > 2 && 2 * misfits(&found) >= used.len() {
+            let rest: Vec<usize> = used.iter().copied().filter(|&i| i != first).collect();
+            if let Some(second) = best(self, &rest) {
+                let other = self.register_on(second, used, sharp, known)?;
+                if misfits(&other) < misfits(&found) {
+                    return Ok(other);
+                }
+            }
+        }
+        Ok(found)
     }
 
     fn register_on(&mut self, reference: usize, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {

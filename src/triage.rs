@@ -63,6 +63,14 @@ const SMALL: usize = 8;
 const FLAT: f64 = 0.02;
 /// What that part of squares of pure noise measures, of its variance.
 const FLATTEST: f64 = 0.75;
+/// Lags in pixels of the differences by which two frames are found to differ by noise alone.
+const NEAR: [usize; 3] = [1, 2, 4];
+/// Standard deviations by which their cross energy is more than nothing.
+const CERTAIN: f64 = 5.0;
+/// The noise of the mean of three channels over what the model says that it may be, and the ratio of the two frames' levels.
+const LEVELS: std::ops::Range<f64> = 0.8..6.0;
+/// See [`LEVELS`].
+const RATIOS: std::ops::Range<f64> = 0.75..1.5;
 /// Lag in pixels of the differences that tell contrast.
 const COARSE: usize = 24;
 /// Directions in which differences are taken.
@@ -139,6 +147,10 @@ struct Luminance {
     valid: Vec<bool>,
     /// Relative error of `variance`.
     noise_error: f64,
+    /// `variance` over what the noise model says.
+    excess: f64,
+    /// See [`Frame::lossy`].
+    lossy: bool,
 }
 
 fn luminance(frame: &Frame, x: &Rgb, curves: &[Vec<f32>; 3]) -> Luminance {
@@ -153,7 +165,7 @@ fn luminance(frame: &Frame, x: &Rgb, curves: &[Vec<f32>; 3]) -> Luminance {
     let floor = 3.0 * (3.0 * noise[0]).sqrt();
     let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && v > floor).collect();
     let variance = around.map(|v| noise::at(&noise, v) / (dt * dt) as f32);
-    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR }
+    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR, excess: 1.0, lossy: frame.lossy }
 }
 
 impl Luminance {
@@ -179,6 +191,7 @@ impl Luminance {
         let excess = self.part(looked).excess();
         self.variance = self.variance.map(|v| v * excess as f32);
         self.noise_error += 1.0 - 1.0 / excess;
+        self.excess = excess;
     }
 
     /// As the pixels of another frame that are `looked` at see it, `motion` being the way from there to here: the nearest pixel, since
@@ -305,6 +318,31 @@ fn share(own: &Energy, other: &Energy) -> Option<Share> {
     (doubt < DETAIL).then_some(Share { likely, most: most + doubt })
 }
 
+/// Whether two frames that lie in one place differ by noise alone, whatever its level: with cross energy X, which noise does not enter, and energies A and B
+/// of the noisier frame and the other, (A - X) / (B - X) is the ratio of their noise. Where the other lacks structure, B is less than X by far more than
+/// its noise, and where it lies elsewhere X falls.
+fn differ_by_noise(a: &Luminance, b: &Luminance, shared: &[bool]) -> bool {
+    let along = |&(direction, lag): &((usize, usize, bool), usize)| {
+        // Cross energy and its variance; of each frame the energy and the noise.
+        let (mut cross, mut scatter, mut of) = (0.0, 0.0, [[0.0f64; 2]; 2]);
+        for_differences(a.value.size(), shared, direction, lag, |_, _, i, j| {
+            let noise = [a, b].map(|l| f64::from(l.variance.data[i] + l.variance.data[j]) / l.excess);
+            let d = [a, b].map(|l| f64::from(l.value.data[i] - l.value.data[j]));
+            let weight = 1.0 / noise[0].max(noise[1]);
+            cross += weight * d[0] * d[1];
+            scatter += (weight * d[0] * d[1]).powi(2);
+            for k in 0..2 {
+                of[k][0] += weight * d[k] * d[k];
+                of[k][1] += weight * noise[k];
+            }
+        });
+        of.sort_by(|p, q| q[1].total_cmp(&p[1]));
+        let level = of.map(|[energy, noise]| (energy - cross) / noise);
+        cross > CERTAIN * scatter.sqrt() && LEVELS.contains(&level[0]) && RATIOS.contains(&(level[1] / level[0]))
+    };
+    DIRECTIONS.iter().flat_map(|&d| NEAR.map(|lag| (d, lag))).collect::<Vec<_>>().iter().all(along)
+}
+
 /// Shares of two frames in each other's fine structure, in the direction in which they are least, as a whole and the pixels of each that are
 /// `looked` at, `motion` being the way from the first's pixels to the second's; `None` where nothing tells.
 fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, looked: &Looked) -> [Option<Share>; 2] {
@@ -316,6 +354,9 @@ fn details(whole: [&Luminance; 2], [a, b]: [&Luminance; 2], motion: &DMat3, look
     let on_b = if apart { b.shared(a_seen) } else { on_a.clone() };
     if [&on_a, &on_b].iter().any(|on| on.iter().filter(|s| **s).count() < FEW) {
         return [None; 2];
+    }
+    if (a.lossy || b.lossy) && differ_by_noise(a, b_seen, &on_a) {
+        return [Some(Share { likely: 1.0, most: 1.0 }); 2];
     }
     let along = |&direction: &(usize, usize, bool)| {
         let of = |lag| [energy(a, b_seen, &on_a, direction, lag), energy(b, a_seen, &on_b, direction, lag)];

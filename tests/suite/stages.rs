@@ -490,6 +490,42 @@ fn codes_of_a_dark_frame_and_noise_of_all_channels_alike_are_no_fine_structure()
     }
 }
 
+/// JPEG files keep their noise beside texture and lose it where nothing else is. In the dark, where most of the fine structure of the short frame is noise, a noise level
+/// by the flat squares leaves two thirds of that noise to pass for structure that the sharp longer frame lacks.
+#[test]
+fn noise_that_a_file_format_leaves_beside_texture_is_no_fine_structure() {
+    let (w, h) = (256, 192);
+    let level = noise::NoiseModel::from_electrons(4000.0, 8.0);
+    let scene = texture(w, h);
+    let flat = |x: usize| (x / 32).is_multiple_of(4);
+    let frame = |exposure_time: f64, seed: u64, softness: isize| {
+        let n = twelve(seed, w * h);
+        let plane = Plane::from_fn(w, h, |x, y| {
+            let around = (-softness..=softness).flat_map(|j| (-softness..=softness).map(move |i| (i, j)));
+            let sum: f32 = around.map(|(i, j)| scene.clamped(x as isize + i, y as isize + j)).sum();
+            let soft = f64::from(sum) / ((2 * softness + 1) * (2 * softness + 1)) as f64;
+            let light = exposure_time * if flat(x) { 0.1 } else { 0.08 + 0.04 * soft };
+            let kept = if flat(x) { 0.05 } else { 1.0 };
+            // The same in all channels: three times the variance in their mean that independent noise has.
+            let z = light + kept * level.variance(light).sqrt() * f64::from(n[y * w + x]) / 2.0;
+            (z.clamp(0.0, 1.0) * 65535.0).round() as f32 / 65535.0
+        });
+        let intensity = Rgb([plane.clone(), plane.clone(), plane]);
+        Frame { name: String::new(), intensity, levels: 65535, chroma_subsampled: true, lossy: true, exposure_time }
+    };
+    let sharp = |softness: isize| -> Vec<bool> {
+        let frames = [frame(0.125, 100, 0), frame(0.5, 200, softness)];
+        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+        let curves = noise::curves(&frames, &Response::Linear, &level);
+        let found = triage::triage(&frames, &exposures, &curves, &[false; 2], None, &[DMat3::IDENTITY; 2]);
+        println!("{softness}: {found:?}");
+        found.iter().map(|v| v.sharp).collect()
+    };
+    assert_eq!(sharp(0), [true, true]);
+    assert_eq!(sharp(1), [true, false], "means of 3 x 3 pixels");
+    assert_eq!(sharp(2), [true, false], "means of 5 x 5 pixels");
+}
+
 #[test]
 fn shaken_frames_are_told_from_sharp_ones() {
     let scene = synth::room(192, 144, 24, 3);
