@@ -12,7 +12,7 @@ use unshaken::noise::NoiseModel;
 use unshaken::pipeline::{self, Outcome, Settings};
 use unshaken::pose::Pose;
 use unshaken::response::{self, Response};
-use unshaken::synth::{self, Camera, SyntheticBracket, Tremor};
+use unshaken::synth::{self, Camera, Drawn, SyntheticBracket, Tremor};
 use unshaken::tsf::{Tsf, TsfEntry, TsfFile};
 
 const SIZE: (usize, usize) = (160, 120);
@@ -215,6 +215,20 @@ fn a_shaken_frame_is_found_beside_one_that_is_surely_sharp() {
 }
 
 /// Frames that pass for sharp and moved by two pixels, too little for a look at half the size: they are deblurred as well.
+/// The second frame lies elsewhere and passes for shaken until it is registered. The shaken one shares its shades with that frame alone.
+#[test]
+fn a_displaced_frame_that_shows_to_be_sharp_helps_to_place_the_others() {
+    let scene = Drawn::Foliage.draw(200, 150, 32, 2, 1);
+    let tremor = |extent_px: f64, roll_deg: f64| Tremor { extent_px, roll_deg, offset_px: 8.0, offset_deg: 0.1 };
+    let times = [(0.01, None), (0.04, Some(tremor(0.01, 0.0))), (0.3, Some(tremor(10.0, 0.5)))];
+    let made = synth::capture(&scene, &Camera::default(), &times, 0.5, 1).unwrap();
+    let found = merge(&made.bracket, &Settings::default(), None);
+    assert!(found.left_out.is_empty(), "{:?}", found.left_out);
+    let frames = found.report["frames"].as_array().unwrap();
+    let sharp: Vec<bool> = frames.iter().map(|f| f["sharp"].as_bool().unwrap()).collect();
+    assert_eq!(sharp, [true, true, false]);
+}
+
 #[test]
 fn a_slight_blur_of_all_frames_is_undone() {
     let (w, h) = (272, 192);
