@@ -450,8 +450,10 @@ impl Run<'_> {
             &format!("{still:?}"),
             |_| 0,
             |run| {
-                let alike: Vec<usize> = still.iter().copied().filter(|&i| run.motions[i] == run.motions[still[0]]).collect();
-                Ok(noise::of_squares(frames, &run.exposures, run.response, &alike, &run.noise))
+                // Of files that keep their noise the first estimate is right, and what a registration that is not quite true leaves would pass for more.
+                let tells = |&i: &usize| frames[i].lossy || run.motions[i] == run.motions[still[0]];
+                let told: Vec<usize> = still.iter().copied().filter(tells).collect();
+                Ok(noise::of_squares(frames, &run.exposures, run.response, &told, &run.motions, &run.noise))
             },
         )?;
         if let Some(noise) = noise {

@@ -165,7 +165,14 @@ fn luminance(frame: &Frame, x: &Rgb, curves: &[Vec<f32>; 3]) -> Luminance {
     let floor = 3.0 * (3.0 * noise[0]).sqrt();
     let valid = around.data.iter().zip(&clipped).map(|(&v, &c)| !c && v > floor).collect();
     let variance = around.map(|v| noise::at(&noise, v) / (dt * dt) as f32);
-    Luminance { value: mean.map(|v| (f64::from(v) / dt) as f32), variance, valid, noise_error: NOISE_ERROR, excess: 1.0, lossy: frame.lossy }
+    Luminance {
+        value: mean.map(|v| (f64::from(v) / dt) as f32),
+        variance,
+        valid,
+        noise_error: NOISE_ERROR,
+        excess: 1.0,
+        lossy: frame.lossy,
+    }
 }
 
 impl Luminance {

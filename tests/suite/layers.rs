@@ -18,7 +18,7 @@ const TABLE: &[(&str, &[&str])] = &[
     ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
     ("response", &["error", "image", "exposure", "mask"]),
-    ("noise", &["error", "image", "exposure", "response", "kernels::NOISE_STEPS"]),
+    ("noise", &["error", "image", "exposure", "response", "pose::project", "sampling", "kernels::NOISE_STEPS"]),
     ("mask", &["error", "image", "exposure", "pose"]),
     ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),
     ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),

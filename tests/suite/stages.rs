@@ -2,7 +2,7 @@
 
 use crate::support::noise as numbers;
 use crate::support::texture;
-use glam::DMat3;
+use glam::{DMat3, DVec2};
 use unshaken::channels;
 use unshaken::exposure::Frame;
 use unshaken::image::{Channels, Plane, Rgb};
@@ -126,17 +126,31 @@ fn texture_that_most_blocks_show_is_no_noise() {
 
 #[test]
 fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
-    let truth = noise::NoiseModel::from_electrons(1000.0, 6.0);
+    struct Film {
+        noise: noise::NoiseModel,
+        gamma: f64,
+        dark: f64,
+    }
+    let day = Film { noise: noise::NoiseModel::from_electrons(1000.0, 6.0), gamma: 1.0, dark: 0.85 };
+    let night = Film { noise: noise::NoiseModel::from_electrons(3000.0, 4.0), gamma: 2.2, dark: 0.4 };
     let (w, h) = (320, 240);
     // What both frames show: steps of 5 pixels, too fine for a square to be without.
-    let level =
-        |x: usize, y: usize| (0.06 + 0.5 * (x as f64 / w as f64).powi(2)) * if (x / 5 + y / 5).is_multiple_of(2) { 1.0 } else { 0.85 };
-    let frame = |exposure_time: f64, seed: u64, quality: Option<u8>| {
+    let level = |x: f64, y: f64, dark: f64| {
+        let step = ((x / 5.0).floor() + (y / 5.0).floor()) as i64;
+        (0.06 + 0.5 * (x / w as f64).powi(2)) * if step % 2 == 0 { 1.0 } else { dark }
+    };
+    // Means over the pixels, `moved` by some.
+    let frame = |exposure_time: f64, seed: u64, quality: Option<u8>, moved: (f64, f64), camera: &Film| {
         let n = twelve(seed, 3 * w * h);
+        let inside = |x: usize, y: usize| {
+            let parts = [0.125, 0.375, 0.625, 0.875]
+                .map(|v| [0.125, 0.375, 0.625, 0.875].map(|u| (x as f64 + u - moved.0, y as f64 + v - moved.1)));
+            parts.as_flattened().iter().map(|&(x, y)| level(x, y, camera.dark)).sum::<f64>() / 16.0
+        };
         let coded = |c: usize, x: usize, y: usize| {
-            let e = exposure_time * level(x, y);
-            let z = e + truth.variance(e).sqrt() * f64::from(n[3 * (y * w + x) + c]) / 2.0;
-            (z.clamp(0.0, 1.0) * 255.0).round() as u8
+            let e = exposure_time * inside(x, y);
+            let z = e + camera.noise.variance(e).sqrt() * f64::from(n[3 * (y * w + x) + c]) / 2.0;
+            (z.clamp(0.0, 1.0).powf(1.0 / camera.gamma) * 255.0).round() as u8
         };
         let mut picture =
             image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb([0, 1, 2].map(|c| coded(c, x as usize, y as usize))));
@@ -156,18 +170,31 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
         }
     };
     for (quality, smoothed) in [(Some(75), true), (Some(90), true), (None, false)] {
-        let frames = [frame(0.4, 500, quality), frame(1.0, 600, quality)];
+        let frames = [frame(0.4, 500, quality, (0.0, 0.0), &day), frame(1.0, 600, quality, (0.0, 0.0), &day)];
         let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
         let first = noise::estimate(&frames, &exposures, &Response::Linear);
-        let again = noise::of_squares(&frames, &exposures, &Response::Linear, &[1, 0], &first);
-        let ratio = |model: &noise::NoiseModel| model.variance(0.1) / truth.variance(0.1);
+        let still = [DMat3::IDENTITY; 2];
+        let again = noise::of_squares(&frames, &exposures, &Response::Linear, &[1, 0], &still, &first);
+        let ratio = |model: &noise::NoiseModel| model.variance(0.1) / day.noise.variance(0.1);
         assert_eq!(again.is_some(), smoothed, "{quality:?}: {:.2} -> {:?}", ratio(&first), again.map(|m| ratio(&m)));
         if let Some(again) = again {
             assert!(ratio(&first) < 0.6, "{quality:?}: {:.2}", ratio(&first));
             assert!((0.8..1.8).contains(&ratio(&again)), "{quality:?}: {:.2}", ratio(&again));
         }
-        assert_eq!(noise::of_squares(&frames, &exposures, &Response::Linear, &[0], &first), None, "one frame has no difference");
+        assert_eq!(noise::of_squares(&frames, &exposures, &Response::Linear, &[0], &still, &first), None, "one frame has no difference");
     }
+    // In the dark of displaced frames as well, where they lie, and nowhere else.
+    let (moved, gamma) = ((3.4, -2.7), Response::Gamma(night.gamma));
+    let frames = [frame(0.2, 500, Some(90), (0.0, 0.0), &night), frame(0.8, 600, Some(90), moved, &night)];
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &gamma)).collect();
+    let first = noise::NoiseModel { shot: 0.4 * night.noise.shot, read: 0.4 * night.noise.read };
+    let found = [moved, (0.0, 0.0)].map(|(x, y)| {
+        let motions = [DMat3::IDENTITY, DMat3::from_translation(DVec2::new(x, y))];
+        let again = noise::of_squares(&frames, &exposures, &gamma, &[0, 1], &motions, &first);
+        again.map(|m| m.variance(0.015) / night.noise.variance(0.015))
+    });
+    assert!(found[0].is_some_and(|r| (0.8..1.5).contains(&r)), "{found:.2?}");
+    assert!(found[1].is_some_and(|r| r > 2.0), "{found:.2?}: beside each other they show different things");
 }
 
 #[test]
