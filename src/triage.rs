@@ -329,7 +329,7 @@ fn share(own: &Energy, other: &Energy) -> Option<Share> {
 /// of the noisier frame and the other, (A - X) / (B - X) is the ratio of their noise. Where the other lacks structure, B is less than X by far more than
 /// its noise, and where it lies elsewhere X falls.
 fn differ_by_noise(a: &Luminance, b: &Luminance, shared: &[bool]) -> bool {
-    let along = |&(direction, lag): &((usize, usize, bool), usize)| {
+    let along = |direction: (usize, usize, bool), lag: usize| {
         // Cross energy and its variance; of each frame the energy and the noise.
         let (mut cross, mut scatter, mut of) = (0.0, 0.0, [[0.0f64; 2]; 2]);
         for_differences(a.value.size(), shared, direction, lag, |_, _, i, j| {
@@ -347,7 +347,7 @@ fn differ_by_noise(a: &Luminance, b: &Luminance, shared: &[bool]) -> bool {
         let level = of.map(|[energy, noise]| (energy - cross) / noise);
         cross > CERTAIN * scatter.sqrt() && LEVELS.contains(&level[0]) && RATIOS.contains(&(level[1] / level[0]))
     };
-    DIRECTIONS.iter().flat_map(|&d| NEAR.map(|lag| (d, lag))).collect::<Vec<_>>().iter().all(along)
+    DIRECTIONS.par_iter().all(|&direction| NEAR.iter().all(|&lag| along(direction, lag)))
 }
 
 /// Shares of two frames in each other's fine structure, in the direction in which they are least, as a whole and the pixels of each that are
