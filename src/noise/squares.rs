@@ -15,10 +15,6 @@ const SQUARE: usize = 8;
 /// Squared differences have no texture to avoid where frames show the same in the same place: their middle stands for all, and that of one squared
 /// normal number is this part of its expectation.
 const MIDDLE: Quantile = Quantile { at: 0.5, of_noise: 0.4549 };
-/// The same from which frames that lie in different places differ by more than noise: their registration is not quite true, or something moved. JPEG takes up
-/// to six sevenths of the noise; displaced frames of a benchmark measure 1.1 to 5.5, those of a photographed night (arch, trees and clouds) 17 at their full
-/// size, 10 at half and 40 at a sixth of it.
-const MOST_SMOOTHED: f64 = 7.0;
 /// Exposure from which what the format makes of edges (colour at half the resolution, rounding by the square) weighs as much as noise does and more: of sharp frames
 /// in place the variance is 0.8 to 1.5 times the sensor's below and up to 5 above, of displaced ones up to 14.
 const DARK: f64 = 0.02;
@@ -28,6 +24,10 @@ const ENOUGH_DARK: usize = 3;
 const HALF: f64 = 0.5;
 /// Variance over what a model says, on the whole, from which the model does not hold.
 const SMOOTHED: f64 = 1.5;
+/// The same from which frames that lie in different places differ by more than noise: their registration is not quite true, or something moved. JPEG takes up
+/// to six sevenths of the noise; displaced frames of a benchmark measure 1.1 to 5.5, those of a photographed night (arch, trees and clouds) 17 at their full
+/// size, 10 at half and 40 at a sixth of it.
+const MOST_SMOOTHED: f64 = 7.0;
 
 /// The noise level of the frames `ids`, which show the same where each lies by `motions` (from one grid to that of every frame, centred pixels), if they have
 /// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next.

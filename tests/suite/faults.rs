@@ -214,7 +214,6 @@ fn a_shaken_frame_is_found_beside_one_that_is_surely_sharp() {
     assert!(free > held + 1.0, "{free:.2} dB, {held:.2} taken for sharp");
 }
 
-/// Frames that pass for sharp and moved by two pixels, too little for a look at half the size: they are deblurred as well.
 /// The second frame lies elsewhere and passes for shaken until it is registered. The shaken one shares its shades with that frame alone.
 #[test]
 fn a_displaced_frame_that_shows_to_be_sharp_helps_to_place_the_others() {
@@ -229,6 +228,7 @@ fn a_displaced_frame_that_shows_to_be_sharp_helps_to_place_the_others() {
     assert_eq!(sharp, [true, true, false]);
 }
 
+/// Frames that pass for sharp and moved by two pixels, too little for a look at half the size: they are deblurred as well.
 #[test]
 fn a_slight_blur_of_all_frames_is_undone() {
     let (w, h) = (272, 192);
