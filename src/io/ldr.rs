@@ -58,7 +58,8 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
         return Err(format("is truncated; copy it again from the camera".into()));
     }
     let lossy = jpeg.is_some();
-    let chroma_subsampled = jpeg.is_some_and(|segments| is_subsampled(&segments));
+    let colour_block = jpeg.and_then(|segments| colour_block(&segments));
+    let chroma_subsampled = colour_block.is_some();
     let mut decoder = reader.into_decoder().map_err(|e| format(reason(&e)))?;
     let (width, height) = decoder.dimensions();
     super::check_size(width as usize, height as usize, bytes.len()).map_err(format)?;
@@ -69,6 +70,10 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<Picture> {
         let orientation = decoder.orientation()?;
         let icc = decoder.icc_profile()?;
         let mut picture = DynamicImage::from_decoder(decoder)?;
+        if let (Some(block), DynamicImage::ImageRgb8(codes)) = (colour_block, &mut picture) {
+            let size = (codes.width() as usize, codes.height() as usize);
+            super::chroma::restore(codes, size, block);
+        }
         picture.apply_orientation(orientation);
         Ok((picture, icc))
     };
@@ -137,12 +142,14 @@ fn jpeg_segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     })
 }
 
-/// Whether the frame header of a JPEG gives its first component, brightness, more samples than another.
-fn is_subsampled(segments: &[(u8, &[u8])]) -> bool {
+/// Pixels across and down for which a JPEG holds one colour, by its frame header; `None` where that is one pixel.
+fn colour_block(segments: &[(u8, &[u8])]) -> Option<(usize, usize)> {
     // SOF0..SOF15 without DHT, JPG and DAC: precision, height, width, number of components; of each its name, samples across and down, table.
     let header = segments.iter().find(|(marker, _)| (0xC0..=0xCF).contains(marker) && ![0xC4, 0xC8, 0xCC].contains(marker));
-    let samples = |component: &[u8]| (component[1] >> 4) * (component[1] & 15);
-    let Some(components) = header.and_then(|(_, content)| content.get(6..)) else { return false };
-    let mut samples = components.chunks_exact(3).map(samples);
-    samples.next().is_some_and(|first| samples.any(|other| other < first))
+    let samples = |component: &[u8]| (usize::from(component[1] >> 4).max(1), usize::from(component[1] & 15).max(1));
+    let mut components = header?.1.get(6..)?.chunks_exact(3).map(samples);
+    let brightness = components.next()?;
+    // Where colours are held unlike, the coarsest.
+    let block = components.map(|c| (brightness.0 / c.0, brightness.1 / c.1)).fold((1, 1), |a, b| (a.0.max(b.0), a.1.max(b.1)));
+    (block != (1, 1)).then_some(block)
 }

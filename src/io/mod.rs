@@ -1,11 +1,13 @@
 //! Bytes to frames and back: files stop here, and so do the error types of the crates that read them.
 //!
-//! * [`input`] reads a frame of any kind: [`ldr`] (PNG, JPEG, TIFF), `raw` (camera raw files, feature `raw`), [`exr`], Radiance HDR;
+//! * [`input`] reads a frame of any kind: [`ldr`] (PNG, JPEG, TIFF; [`chroma`]: colour that JPEG files hold coarsely), `raw` (camera raw
+//!   files, feature `raw`), [`exr`], Radiance HDR;
 //!   [`metadata`] what the camera noted, [`icc`] what an embedded profile says of its colours;
 //! * [`exif`] writes frames with their exposure time;
 //! * [`exr`], [`picture`] and [`gainmap`] write results, linear or for display;
 //! * [`output`] writes every result beside its target and renames it, so that nothing is ever half-written.
 
+pub mod chroma;
 pub mod exif;
 pub mod exr;
 pub mod gainmap;

@@ -16,6 +16,8 @@ mod baseline;
 mod batch;
 /// Brackets without a sharp frame.
 mod blind;
+/// Colour that files hold coarsely.
+mod chroma;
 /// The program as a user runs it: outputs, messages, exit codes.
 mod cli;
 /// Collaborative filtering against its oracle, and what it must keep.
