@@ -24,14 +24,14 @@ const ENOUGH_DARK: usize = 3;
 const HALF: f64 = 0.5;
 /// Variance over what a model says, on the whole, from which the model does not hold.
 const SMOOTHED: f64 = 1.5;
-/// The same from which frames that lie in different places differ by more than noise: their registration is not quite true, or something moved. JPEG takes up
-/// to six sevenths of the noise; displaced frames of a benchmark measure 1.1 to 5.5, those of a photographed night (arch, trees and clouds) 17 at their full
-/// size, 10 at half and 40 at a sixth of it.
-const MOST_SMOOTHED: f64 = 7.0;
+/// The most that displaced frames are believed to have, over what the model says: beyond, something moved. JPEG takes up to thirteen fourteenths of the noise, and what pixels
+/// alias, up to five times the sensor's variance in squares, is an error of theirs as well.
+const MOST_SMOOTHED: f64 = 50.0;
 
 /// The noise level of the frames `ids`, which show the same where each lies by `motions` (from one grid to that of every frame, centred pixels), if they have
-/// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next.
-/// `None` where `model` does well, too little is unclipped, or displaced frames differ by more than noise.
+/// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next; of displaced
+/// frames those of the flattest squares, of which a registration that is not quite true changes the least.
+/// `None` where `model` does well or too little is unclipped.
 pub fn of_squares(
     frames: &[Frame],
     exposures: &[Rgb],
@@ -43,7 +43,11 @@ pub fn of_squares(
     let of_pair = |(i, j): (usize, usize)| {
         let in_place = motions[i] == motions[j];
         let motion = if in_place { DMat3::IDENTITY } else { motions[j] * motions[i].inverse() };
-        let all = bins(differences(frames, exposures, response, i, j, &motion), &MIDDLE, MANY);
+        let mut found = differences(frames, exposures, response, i, j, &motion);
+        if !in_place {
+            found = flattest(found);
+        }
+        let all = bins(found.into_iter().map(|d| d.sample).collect(), &MIDDLE, MANY);
         all.into_iter().filter(move |s| in_place || s.exposure < DARK)
     };
     let mut samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
@@ -57,34 +61,67 @@ pub fn of_squares(
     }
     let displaced = ids.iter().any(|&i| motions[i] != motions[ids[0]]);
     let most = if displaced { MOST_SMOOTHED } else { f64::INFINITY };
-    (excess > SMOOTHED.ln() * count && excess < most.ln() * count).then(|| fit(&samples, HALF)).flatten()
+    let found = if excess > SMOOTHED.ln() * count { fit(&samples, HALF)? } else { return None };
+    let beyond = ((excess / count).exp() / most).max(1.0);
+    Some(NoiseModel { shot: found.shot / beyond, read: found.read / beyond })
+}
+
+/// What two neighbouring squares say of the noise.
+struct Difference {
+    sample: Sample,
+    /// Mean square over squared mean of the longer frame's exposure, in the square where that is larger.
+    contrast: f64,
 }
 
 /// Squared differences of neighbouring squares of frame `i` less frame `j`, which is the longer one and lies at `motion` from it, all channels, as variances of
 /// single pixels. Interpolation between the longer one's pixels takes up to an eighth of its part, which is the lesser, and is not made up for.
-fn differences(frames: &[Frame], exposures: &[Rgb], response: &Response, i: usize, j: usize, motion: &DMat3) -> Vec<Sample> {
+fn differences(frames: &[Frame], exposures: &[Rgb], response: &Response, i: usize, j: usize, motion: &DMat3) -> Vec<Difference> {
     let ratio = frames[i].exposure_time / frames[j].exposure_time;
     let levels = frames[i].levels.min(frames[j].levels);
     let of_channel = |c: usize| {
         let quantum = quantisation(response, c, levels);
         let means = means([&frames[i].intensity.0[c], &frames[j].intensity.0[c]], [&exposures[i].0[c], &exposures[j].0[c]], ratio, motion);
         let columns = exposures[i].width() / SQUARE;
-        let sample = |(a, b): (&(f64, f64), &(f64, f64))| {
-            let exposure = 0.5 * (a.0 + b.0);
-            let square = 0.5 * (a.1 - b.1).powi(2) * (SQUARE * SQUARE) as f64;
+        let difference = |(a, b): (&Square, &Square)| {
+            let exposure = 0.5 * (a.own + b.own);
+            let square = 0.5 * (a.less - b.less).powi(2) * (SQUARE * SQUARE) as f64;
             // The quantile is divided by its part of the expectation later on.
-            Sample::new(exposure, ratio, (square - MIDDLE.of_noise * rounding(&quantum, exposure, ratio)).max(0.0))
+            let variance = (square - MIDDLE.of_noise * rounding(&quantum, exposure, ratio)).max(0.0);
+            Difference { sample: Sample::new(exposure, ratio, variance), contrast: a.contrast.max(b.contrast) }
         };
-        let pair = |k: usize, next: usize| Some(sample((means[k].as_ref()?, means.get(next)?.as_ref()?)));
+        let pair = |k: usize, next: usize| Some(difference((means[k].as_ref()?, means.get(next)?.as_ref()?)));
         let across = (0..means.len()).filter(|k| (k + 1) % columns != 0).filter_map(|k| pair(k, k + 1));
         across.chain((0..means.len()).filter_map(|k| pair(k, k + columns))).collect::<Vec<_>>()
     };
     (0..3).into_par_iter().flat_map_iter(of_channel).collect()
 }
 
-/// Mean over each whole square of the shorter frame's exposure, and of it less `ratio` times that of the longer one, which lies at `motion` from it, where both are
-/// unclipped throughout.
-fn means(intensities: [&Plane; 2], exposures: [&Plane; 2], ratio: f64, motion: &DMat3) -> Vec<Option<(f64, f64)>> {
+/// The third of `all`, among those of like exposure, whose squares are the flattest.
+fn flattest(mut all: Vec<Difference>) -> Vec<Difference> {
+    all.sort_by(|a, b| a.sample.exposure.total_cmp(&b.sample.exposure));
+    let mut kept = Vec::with_capacity(all.len() / 3 + 1);
+    let mut rest = all.into_iter().peekable();
+    while rest.peek().is_some() {
+        let mut alike: Vec<Difference> = rest.by_ref().take(3 * MANY).collect();
+        alike.sort_by(|a, b| a.contrast.total_cmp(&b.contrast));
+        alike.truncate(alike.len().div_ceil(3));
+        kept.append(&mut alike);
+    }
+    kept
+}
+
+/// Means over a square.
+struct Square {
+    /// Of the shorter frame's exposure.
+    own: f64,
+    /// Of that less the ratio of the exposure times as often the longer frame's.
+    less: f64,
+    /// Mean square of the longer frame's exposure over its squared mean.
+    contrast: f64,
+}
+
+/// Each whole square of the shorter frame beside the longer one, which lies at `motion` from it, where both are unclipped throughout.
+fn means(intensities: [&Plane; 2], exposures: [&Plane; 2], ratio: f64, motion: &DMat3) -> Vec<Option<Square>> {
     let (width, height) = exposures[0].size();
     let (columns, rows) = (width / SQUARE, height / SQUARE);
     let centre = 0.5 * DVec2::new(width as f64 - 1.0, height as f64 - 1.0);
@@ -103,17 +140,18 @@ fn means(intensities: [&Plane; 2], exposures: [&Plane; 2], ratio: f64, motion: &
     };
     let mean = |k: usize| {
         let (x, y) = (k % columns * SQUARE, k / columns * SQUARE);
-        let (mut own, mut less) = (0.0, 0.0);
+        let (mut own, mut longer_one, mut squares) = (0.0, 0.0, 0.0);
         for (i, j) in (y..y + SQUARE).flat_map(|j| (x..x + SQUARE).map(move |i| (i, j))) {
             if !clear(intensities[0], i, j) {
                 return None;
             }
-            let short = f64::from(exposures[0].at(i, j));
-            own += short;
-            less += short - ratio * longer(i, j)?;
+            let value = longer(i, j)?;
+            own += f64::from(exposures[0].at(i, j));
+            longer_one += value;
+            squares += value * value;
         }
         let n = (SQUARE * SQUARE) as f64;
-        Some((own / n, less / n))
+        Some(Square { own: own / n, less: (own - ratio * longer_one) / n, contrast: n * squares / (longer_one * longer_one) })
     };
     (0..columns * rows).map(mean).collect()
 }

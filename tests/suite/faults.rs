@@ -323,7 +323,7 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
     let found = pipeline::merge(&small, &response, &Settings::default(), None, &mut |_| true).unwrap();
     let blind = &found.report["blind"];
     println!("{blind}");
-    assert!(blind["set_free"]["held_out_chi_squared"].as_f64().unwrap() > 100.0, "they disagree: {blind}");
+    assert!(blind["set_free"]["held_out_chi_squared"].as_f64().unwrap() > 30.0, "they disagree: {blind}");
     assert_eq!(found.degraded, Vec::<String>::new());
     for frame in found.report["frames"].as_array().unwrap() {
         assert_eq!((&frame["used"], &frame["sharp"]), (&true.into(), &true.into()), "{}: {}", frame["frame"], frame["triage"]);
