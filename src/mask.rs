@@ -36,7 +36,7 @@ pub fn clipped(frame: &Frame, channels: Channels) -> Vec<bool> {
 }
 
 /// Pixels from a clipped one up to which it spoils the colour of a file that holds colour at half the resolution, and interpolates it.
-const SPOILT: usize = 2;
+const SPOILT: usize = 1;
 
 /// Where any of `channels` of the frame is clipped, or mixed with neighbours that are.
 pub fn spoilt(frame: &Frame, channels: Channels) -> Vec<bool> {

@@ -53,7 +53,7 @@ pub(super) enum Command {
     Tonemap(TonemapArgs),
     /// Open a window: see a bracket, nudge it, export it
     #[cfg(feature = "preview")]
-    Preview(super::preview::PreviewArgs),
+    Preview(PreviewArgs),
     /// Find the brackets among many photographs and merge each
     Batch(BatchArgs),
     /// Print the completions of a shell, or the manual page
@@ -334,4 +334,30 @@ pub(super) struct DemoArgs {
     /// Folder for the results
     #[arg(long, value_name = "DIR", default_value = "unshaken-demo")]
     pub output_dir: PathBuf,
+}
+
+#[cfg(feature = "preview")]
+const PREVIEW_EXAMPLES: &str = "Examples:
+  unshaken preview IMG_1.jpg IMG_2.jpg IMG_3.jpg
+  unshaken preview --blur session.json";
+
+#[cfg(feature = "preview")]
+#[derive(Debug, Args)]
+#[command(after_help = PREVIEW_EXAMPLES)]
+pub(super) struct PreviewArgs {
+    /// Frames of one scene, or a saved session (.json); more can be opened in the window
+    #[arg(value_name = "FRAME")]
+    pub files: Vec<PathBuf>,
+    /// Save a picture of the window once the full-size result is shown, and close it
+    #[arg(long, value_name = "OUT.png")]
+    pub screenshot: Option<PathBuf>,
+    /// Size of the window in points, such as 1440x900
+    #[arg(long, value_name = "WxH")]
+    pub size: Option<String>,
+    /// Begin with the blur view
+    #[arg(long)]
+    pub blur: bool,
+    /// Colours of the window [default: the system's]
+    #[arg(long, value_name = "light|dark", value_parser = ["light", "dark"])]
+    pub theme: Option<String>,
 }

@@ -1,40 +1,14 @@
 //! `unshaken preview`: the window, and `merge` behind it.
 
-use super::args::{Command, MergeArgs};
+use super::args::{Command, MergeArgs, PreviewArgs};
 use super::merge::{self, Asked};
 use super::options::{self, Parsed, Refused};
 use crate::colour::{self, Primaries};
 use crate::exposure::Bracket;
 use crate::pipeline::{Event, Outcome, Settings};
 use crate::preview::{self, Opened, Program, session::Recent};
-use clap::Args;
 use std::ffi::OsString;
-use std::path::PathBuf;
 use std::sync::Arc;
-
-const EXAMPLES: &str = "Examples:
-  unshaken preview IMG_1.jpg IMG_2.jpg IMG_3.jpg
-  unshaken preview --blur session.json";
-
-#[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
-pub(super) struct PreviewArgs {
-    /// Frames of one scene, or a saved session (.json); more can be opened in the window
-    #[arg(value_name = "FRAME")]
-    pub files: Vec<PathBuf>,
-    /// Save a picture of the window once the full-size result is shown, and close it
-    #[arg(long, value_name = "OUT.png")]
-    pub screenshot: Option<PathBuf>,
-    /// Size of the window in points, such as 1440x900
-    #[arg(long, value_name = "WxH")]
-    pub size: Option<String>,
-    /// Begin with the blur view
-    #[arg(long)]
-    pub blur: bool,
-    /// Colours of the window [default: the system's]
-    #[arg(long, value_name = "light|dark", value_parser = ["light", "dark"])]
-    pub theme: Option<String>,
-}
 
 pub(super) fn run(args: &PreviewArgs) -> anyhow::Result<()> {
     let size = match args.size.as_deref() {

@@ -18,6 +18,8 @@ const MIDDLE: Quantile = Quantile { at: 0.5, of_noise: 0.4549 };
 /// Exposure from which what the format makes of edges (colour at half the resolution, rounding by the square) weighs as much as noise does and more: of sharp frames
 /// in place the variance is 0.8 to 1.5 times the sensor's below and up to 5 above, of displaced ones up to 14.
 const DARK: f64 = 0.02;
+/// Exposure up to which the flattest squares of displaced frames are of use.
+const FLAT: f64 = 0.1;
 /// So many bins below tell a line by themselves.
 const ENOUGH_DARK: usize = 3;
 /// Part of the bins that the fitted line passes above.
@@ -29,8 +31,9 @@ const SMOOTHED: f64 = 1.5;
 const MOST_SMOOTHED: f64 = 50.0;
 
 /// The noise level of the frames `ids`, which show the same where each lies by `motions` (from one grid to that of every frame, centred pixels), if they have
-/// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next; of displaced
-/// frames those of the flattest squares, of which a registration that is not quite true changes the least.
+/// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next. Of displaced
+/// frames the flattest squares, of which a registration that is not quite true changes the least, tell by how much there is more; they are too few to tell shot noise from read
+/// noise.
 /// `None` where `model` does well or too little is unclipped.
 pub fn of_squares(
     frames: &[Frame],
@@ -48,10 +51,11 @@ pub fn of_squares(
             found = flattest(found);
         }
         let all = bins(found.into_iter().map(|d| d.sample).collect(), &MIDDLE, MANY);
-        all.into_iter().filter(move |s| in_place || s.exposure < DARK)
+        all.into_iter().filter(move |s| in_place || s.exposure < FLAT)
     };
     let mut samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
-    if samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
+    let displaced = ids.iter().any(|&i| motions[i] != motions[ids[0]]);
+    if !displaced && samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
         samples.retain(|s| s.exposure < DARK);
     }
     let (mut excess, mut count) = (0.0, 0.0);
@@ -59,11 +63,14 @@ pub fn of_squares(
         excess += s.blocks * (s.variance / s.of(model)).ln();
         count += s.blocks;
     }
-    let displaced = ids.iter().any(|&i| motions[i] != motions[ids[0]]);
-    let most = if displaced { MOST_SMOOTHED } else { f64::INFINITY };
-    let found = if excess > SMOOTHED.ln() * count { fit(&samples, HALF)? } else { return None };
-    let beyond = ((excess / count).exp() / most).max(1.0);
-    Some(NoiseModel { shot: found.shot / beyond, read: found.read / beyond })
+    if samples.is_empty() || excess <= SMOOTHED.ln() * count {
+        return None;
+    }
+    if !displaced {
+        return fit(&samples, HALF);
+    }
+    let more = (excess / count).exp().min(MOST_SMOOTHED);
+    Some(NoiseModel { shot: more * model.shot, read: more * model.read })
 }
 
 /// What two neighbouring squares say of the noise.

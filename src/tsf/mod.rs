@@ -6,6 +6,7 @@ mod align_within;
 mod continuous;
 mod estimate;
 mod from_psfs;
+mod grid_search;
 mod model;
 mod taps;
 mod unseen;
