@@ -9,70 +9,81 @@ use rayon::prelude::*;
 use std::array::from_fn;
 
 /// Rounds in which the interpolation of decoders is undone, to find the colour that the file holds.
-const ROUNDS: usize = 3;
+const ROUNDS: usize = 2;
 /// Variance, in codes², of what JPEG and noise leave of brightness on the coarse grid: less than that tells no slope.
 const FAINT: f32 = 16.0;
 
-/// The coarse grid of an image: a point in the middle of each block of pixels.
-struct Grid {
-    /// Pixels of a block across and down.
-    block: (usize, usize),
-    /// Points across and down.
-    size: (usize, usize),
-    /// Pixels of the image across and down.
-    image: (usize, usize),
-    /// For each column of the image the point at or before it, the next one, and the part that this has.
-    columns: Vec<(usize, usize, f32)>,
-    rows: Vec<(usize, usize, f32)>,
+/// The coarse grid of an image along one side: a point in the middle of each block of pixels.
+struct Side {
+    /// Pixels of a block.
+    block: usize,
+    /// Points.
+    points: usize,
+    /// For each pixel the point at or before it, the next one, and the part that this has in a linear interpolation, as decoders do it.
+    between: Vec<(usize, usize, f32)>,
 }
 
-impl Grid {
-    fn new(image: (usize, usize), block: (usize, usize)) -> Self {
-        let size = (image.0.div_ceil(block.0), image.1.div_ceil(block.1));
-        let between = |pixels: usize, block: usize, points: usize| -> Vec<(usize, usize, f32)> {
-            let place = |i: usize| ((i as f32 + 0.5) / block as f32 - 0.5).clamp(0.0, (points - 1) as f32);
-            (0..pixels).map(|i| (place(i) as usize, (place(i) as usize + 1).min(points - 1), place(i).fract())).collect()
-        };
-        Self { block, size, image, columns: between(image.0, block.0, size.0), rows: between(image.1, block.1, size.1) }
+impl Side {
+    fn new(pixels: usize, block: usize) -> Self {
+        let points = pixels.div_ceil(block);
+        let place = |i: usize| ((i as f32 + 0.5) / block as f32 - 0.5).clamp(0.0, (points - 1) as f32);
+        let between = (0..pixels).map(|i| (place(i) as usize, (place(i) as usize + 1).min(points - 1), place(i).fract())).collect();
+        Self { block, points, between }
     }
 
-    /// Mean over each block of the pixels' values.
-    fn means(&self, value: impl Fn(usize, usize) -> f32 + Sync) -> Plane {
-        let (across, down) = self.block;
-        Plane::from_fn(self.size.0, self.size.1, |i, j| {
-            let (left, top) = (i * across, j * down);
-            let (right, bottom) = ((left + across).min(self.image.0), (top + down).min(self.image.1));
-            let sum: f32 = (top..bottom).flat_map(|y| (left..right).map(move |x| (x, y))).map(|(x, y)| value(x, y)).sum();
-            sum / ((right - left) * (bottom - top)) as f32
-        })
-    }
-
-    /// `points` interpolated linearly, as decoders do, at the pixel (x, y).
-    fn at(&self, points: &Plane, x: usize, y: usize) -> f32 {
-        let ((a, b, t), (c, d, u)) = (self.columns[x], self.rows[y]);
-        let row = |j: usize| (1.0 - t) * points.at(a, j) + t * points.at(b, j);
-        (1.0 - u) * row(c) + u * row(d)
+    /// What the mean over a block of interpolated points has of the point before, its own and the next.
+    fn blurred(&self) -> [f32; 3] {
+        let part = (0..self.block).map(|i| ((i as f32 + 0.5) / self.block as f32 - 0.5).abs()).sum::<f32>() / (2 * self.block) as f32;
+        [part, 1.0 - 2.0 * part, part]
     }
 }
 
-/// `plane` under a window of three by three of these weights, continued by its border.
-fn window(plane: &Plane, weights: [f32; 3]) -> Plane {
-    let over = |plane: &Plane, (dx, dy): (isize, isize)| {
-        Plane::from_fn(plane.width, plane.height, |x, y| {
-            let tap = |k: usize| weights[k] * plane.clamped(x as isize + (k as isize - 1) * dx, y as isize + (k as isize - 1) * dy);
-            tap(0) + tap(1) + tap(2)
-        })
+/// Mean over each block of brightness and of both colours of `raw`.
+fn means(raw: &[u8], across: &Side, down: &Side) -> [Plane; 3] {
+    let (width, height) = (across.between.len(), down.between.len());
+    let cell = |k: usize| {
+        let (left, top) = (k % across.points * across.block, k / across.points * down.block);
+        let (right, bottom) = ((left + across.block).min(width), (top + down.block).min(height));
+        let mut sum = [0.0; 3];
+        for y in top..bottom {
+            for pixel in raw[3 * (y * width + left)..3 * (y * width + right)].chunks_exact(3) {
+                sum.iter_mut().zip(luma_and_chroma(pixel)).for_each(|(s, v)| *s += v);
+            }
+        }
+        sum.map(|s| s / ((right - left) * (bottom - top)) as f32)
     };
-    over(&over(plane, (1, 0)), (0, 1))
+    let cells: Vec<[f32; 3]> = (0..across.points * down.points).into_par_iter().map(cell).collect();
+    from_fn(|c| Plane { width: across.points, height: down.points, data: cells.iter().map(|v| v[c]).collect() })
 }
 
-/// Slope of `colour` over `brightness` around each point, by least squares.
-fn slopes(brightness: &Plane, colour: &Plane) -> Plane {
-    let mean = |p: &Plane| window(p, [0.25, 0.5, 0.25]);
-    let (b, c) = (mean(brightness), mean(colour));
-    let covariance = mean(&brightness.zip(colour, |b, c| b * c)).zip(&b.zip(&c, |b, c| b * c), |m, p| m - p);
-    let variance = mean(&brightness.map(|b| b * b)).zip(&b, |m, b| m - b * b);
-    window(&covariance.zip(&variance, |c, v| c / (v.max(0.0) + FAINT)), [1.0 / 3.0; 3])
+/// `plane` under a window of three by three, of these weights across and down, continued by its border.
+fn window(plane: &Plane, across: [f32; 3], down: [f32; 3]) -> Plane {
+    let (width, height) = plane.size();
+    let beside = Plane::from_rows(width, height, |y, out| {
+        let row = plane.row(y);
+        let [before, own, after] = across;
+        for (x, v) in out.iter_mut().enumerate() {
+            *v = before * row[x.saturating_sub(1)] + own * row[x] + after * row[(x + 1).min(width - 1)];
+        }
+    });
+    Plane::from_rows(width, height, |y, out| {
+        let rows = [y.saturating_sub(1), y, (y + 1).min(height - 1)].map(|j| beside.row(j));
+        for (x, v) in out.iter_mut().enumerate() {
+            *v = down[0] * rows[0][x] + down[1] * rows[1][x] + down[2] * rows[2][x];
+        }
+    })
+}
+
+/// Slopes of `colours` over `brightness` around each point, by least squares.
+fn slopes(brightness: &Plane, colours: &[Plane; 2]) -> [Plane; 2] {
+    let mean = |p: &Plane| window(p, [0.25, 0.5, 0.25], [0.25, 0.5, 0.25]);
+    let b = mean(brightness);
+    let variance = mean(&brightness.map(|b| b * b)).zip(&b, |m, b| (m - b * b).max(0.0) + FAINT);
+    colours.each_ref().map(|colour| {
+        let products = b.zip(&mean(colour), |b, c| b * c);
+        let covariance = mean(&brightness.zip(colour, |b, c| b * c)).zip(&products, |m, p| m - p);
+        window(&covariance.zip(&variance, |c, v| c / v), [1.0 / 3.0; 3], [1.0 / 3.0; 3])
+    })
 }
 
 /// Brightness Y and colours C_B, C_R (both around 0) of a pixel's codes, as in JFIF.
@@ -86,30 +97,34 @@ fn luma_and_chroma(pixel: &[u8]) -> [f32; 3] {
 fn codes([y, blue, red]: [f32; 3]) -> [u8; 3] {
     let (r, b) = (y + 1.402 * red, y + 1.772 * blue);
     let g = (y - 0.299 * r - 0.114 * b) / 0.587;
-    [r, g, b].map(|v| v.round().clamp(0.0, 255.0) as u8)
+    // The conversion keeps within 0 and 255.
+    [r, g, b].map(|v| (v + 0.5) as u8)
 }
 
 /// Brings back the colour of `raw`, red, green and blue codes one pixel after another, of an image of `size` = (width, height) pixels whose file holds one
 /// colour for each block of `block` = (across, down) pixels. Brightness stays, but for rounding.
 pub fn restore(raw: &mut [u8], size: (usize, usize), block: (usize, usize)) {
-    let grid = Grid::new(size, block);
-    let decoded = |x: usize, y: usize| luma_and_chroma(&raw[3 * (y * size.0 + x)..]);
-    let brightness = grid.means(|x, y| decoded(x, y)[0]);
-    let held: [Plane; 2] = from_fn(|k| {
-        let mut held = grid.means(|x, y| decoded(x, y)[k + 1]);
+    let (across, down) = (Side::new(size.0, block.0), Side::new(size.1, block.1));
+    let [brightness, blue, red] = means(raw, &across, &down);
+    let held = [blue, red].map(|decoded| {
+        // Means of what was interpolated are blurred.
+        let mut held = decoded.clone();
         for _ in 0..ROUNDS {
-            let missing = grid.means(|x, y| decoded(x, y)[k + 1] - grid.at(&held, x, y));
-            held = held.zip(&missing, |h, m| h + m);
+            let again = window(&held, across.blurred(), down.blurred());
+            held = held.zip(&decoded.zip(&again, |d, a| d - a), |h, missing| h + missing);
         }
         held
     });
-    let slopes = held.each_ref().map(|held| slopes(&brightness, held));
+    let slopes = slopes(&brightness, &held);
+    let planes = [&brightness, &held[0], &held[1], &slopes[0], &slopes[1]];
     raw.par_chunks_exact_mut(3 * size.0).enumerate().for_each(|(y, row)| {
-        for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+        let (above, below, part) = down.between[y];
+        let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
+        let rows = planes.map(|p| p.row(above).iter().zip(p.row(below)).map(|(a, b)| mix(*a, *b, part)).collect::<Vec<f32>>());
+        for (pixel, &(left, right, part)) in row.chunks_exact_mut(3).zip(&across.between) {
             let own = luma_and_chroma(pixel)[0];
-            let detail = own - grid.at(&brightness, x, y);
-            let [blue, red] = from_fn(|k| grid.at(&held[k], x, y) + grid.at(&slopes[k], x, y) * detail);
-            pixel.copy_from_slice(&codes([own, blue, red]));
+            let [coarse, blue, red, of_blue, of_red] = rows.each_ref().map(|r| mix(r[left], r[right], part));
+            pixel.copy_from_slice(&codes([own, blue + of_blue * (own - coarse), red + of_red * (own - coarse)]));
         }
     });
 }
