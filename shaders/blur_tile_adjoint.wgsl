@@ -1,7 +1,7 @@
 // Exact adjoint of K for a tile of the latent grid: per base warp, the shifted sums of the frame where the warp's targets of the tile lie,
 // 32 by 32 pixels, then latent(p) += factor * sum over targets q of sums(q) k(u) k(v), where (u, v) is the source position of q less p,
 // computed as forward does. A gather, so no atomics and one result always. For warps that turn and stretch little: the targets of four
-// pixels of a column then lie in windows of 2 SUPPORT + 1 pixels, each a row below the one before; see Blur::near for "little".
+// pixels of a column then lie in windows of 2 SUPPORT + 1 pixels, each a row below the one before; see Spread::near for "little".
 override SUPPORT: i32 = 2;
 
 // The frame, 0 beyond it.

@@ -1,7 +1,7 @@
 // Exact adjoint of the warps, E(p) += factor * sum over bases b and targets q of weight_b in_b(q) k(u) k(v), where (u, v) is the
 // source position of q less p, computed by the same expression as forward. A gather, so no atomics and one result always. For warps
 // that turn and stretch little: the targets of four by two neighbouring pixels then lie in one window of 4 + 2 SUPPORT by 2 + 2 SUPPORT
-// pixels, and every value of the window is loaded, and its position computed, once for all eight. See Blur::near for "little".
+// pixels, and every value of the window is loaded, and its position computed, once for all eight. See Spread::near for "little".
 @compute @workgroup_size(16, 8)
 fn main(@builtin(global_invocation_id) id: vec3u) {
     let size = params.size;

@@ -5,16 +5,21 @@ macro_rules! source {
     ($($file:literal),+) => { concat!($(include_str!(concat!("../../shaders/", $file, ".wgsl"))),+) };
 }
 
+mod bands;
 mod blur;
 mod data;
 mod display;
+mod geometry;
 mod linear;
+mod scratch;
+mod tables;
 mod tiles;
 
-pub use blur::{Blur, BlurKernels, Scratch, ScratchSize};
+pub use blur::{Blur, BlurKernels};
 pub use data::{DataKernels, Misfit, MisfitSource, NOISE_STEPS, REACH, UNSEEN, WeightTarget};
 pub use display::{Display, DisplayParams, Part, Place};
 pub use linear::{HALO, LinearKernels, SCALARS, SLOT_CURVATURE, SLOT_DATA, SLOT_ENERGY, SLOT_SMOOTHNESS, SLOTS, partials_1d, partials_2d};
+pub use scratch::{Scratch, ScratchSize};
 
 use crate::gpu::Gpu;
 use crate::tsf::Interpolation;
@@ -59,13 +64,13 @@ impl Kernels {
 
 /// Every shader of the program as (name, whole source), for validation without a GPU.
 pub const SHADERS: &[(&str, &str)] = &[
-    ("padded", blur::PADDED),
-    ("warp", blur::WARP),
-    ("warp_direct", blur::WARP_DIRECT),
-    ("warp_adjoint", blur::WARP_ADJOINT),
-    ("warp_adjoint_near", blur::WARP_ADJOINT_NEAR),
-    ("tap_sum", blur::TAP_SUM),
-    ("tap_adjoint", blur::TAP_ADJOINT),
+    ("padded", bands::PADDED),
+    ("warp", bands::WARP),
+    ("warp_direct", bands::WARP_DIRECT),
+    ("warp_adjoint", bands::WARP_ADJOINT),
+    ("warp_adjoint_near", bands::WARP_ADJOINT_NEAR),
+    ("tap_sum", bands::TAP_SUM),
+    ("tap_adjoint", bands::TAP_ADJOINT),
     ("blur_tile", tiles::BLUR_TILE),
     ("blur_tile_adjoint", tiles::BLUR_TILE_ADJOINT),
     ("weights", data::WEIGHTS),
@@ -89,10 +94,10 @@ pub const SHADERS: &[(&str, &str)] = &[
 
 /// Sizes of the Rust mirrors of the shaders' `Params` as (shader, bytes), to be compared with what naga lays out.
 pub fn params_sizes() -> Vec<(&'static str, usize)> {
-    [blur::params_sizes(), tiles::params_sizes(), data::params_sizes(), linear::params_sizes(), display::params_sizes()].concat()
+    [bands::params_sizes(), tiles::params_sizes(), data::params_sizes(), linear::params_sizes(), display::params_sizes()].concat()
 }
 
 /// Sizes of the Rust mirrors of the shaders' table entries as (shader, structure, bytes), likewise.
 pub fn table_sizes() -> Vec<(&'static str, &'static str, usize)> {
-    blur::table_sizes()
+    tables::table_sizes()
 }

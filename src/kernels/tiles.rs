@@ -1,8 +1,12 @@
-//! K and Kᵀ a tile at a time in workgroup memory: the design for GPUs, see shaders/common/tile.wgsl.
+//! K and Kᵀ a tile at a time: rotate-then-shift in workgroup memory, the design for GPUs; see shaders/common/tile.wgsl. Needs no scratch but
+//! what stands for channels that are not there; for warps that turn and stretch little.
 
-use super::blur::{BASES, Blur, BlurKernels, Group, Scratch, TABLE, append_runs, grid, rows_of};
+use super::geometry::{Geometry, grid, range};
+use super::scratch::Scratch;
+use super::tables::{BASES, BaseTable, GROUP_TAPS, Group, TABLE, append_group, upload};
 use crate::gpu::{Gpu, Kernel, Step};
 use std::ops::Range;
+use std::sync::OnceLock;
 
 pub(super) const BLUR_TILE: &str = source!("common/plane", "common/pose", "common/output", "common/tile", "common/keep", "blur_tile");
 pub(super) const BLUR_TILE_ADJOINT: &str =
@@ -14,6 +18,8 @@ const SIDE: usize = 32;
 const BEYOND: usize = 2;
 /// Smallest side of a tile of the latent grid with which this design pays.
 const LEAST_SIDE: usize = 12;
+/// Pixels that one invocation of shaders/blur_tile_adjoint.wgsl makes.
+pub(super) const COLUMN: (usize, usize) = (1, 4);
 
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
@@ -36,14 +42,30 @@ pub(super) fn params_sizes() -> Vec<(&'static str, usize)> {
     ["blur_tile", "blur_tile_adjoint"].map(|s| (s, size_of::<TileParams>())).to_vec()
 }
 
-/// The compiled kernels.
-pub(super) struct TileKernels {
+/// Pixels that workgroup memory may hold, of three `f32` each: 16, 20 or 24 KiB, the least that is enough. What a workgroup takes, others that
+/// could run beside it do not have: on an H200, 24 KiB take 1.15 times as long as 16, and 32 KiB 1.8 times.
+const HELD: [usize; 3] = [1365, 1706, 2048];
+
+/// The compiled kernels, for one channel and for three, each for any base warps and for those that do not foreshorten, by the workgroup memory
+/// they take.
+#[derive(Default)]
+pub(super) struct TileKernels([[[OnceLock<Compiled>; HELD.len()]; 2]; 2]);
+
+impl TileKernels {
+    /// Those for `channels` channels at a time that `tiles` need, of an interpolation `support` pixels to either side.
+    fn compiled(&self, gpu: &Gpu, support: usize, channels: usize, tiles: &Tiles) -> &Compiled {
+        let kernels = &self.0[usize::from(channels > 1)][usize::from(tiles.planar)][tiles.held];
+        kernels.get_or_init(|| Compiled::new(gpu, support, channels, tiles.planar, HELD[tiles.held]))
+    }
+}
+
+struct Compiled {
     /// Overwriting, adding.
     forward: [Kernel; 2],
     adjoint: Kernel,
 }
 
-impl TileKernels {
+impl Compiled {
     /// Those of one interpolation, for so many channels; `planar` where no base warp foreshortens.
     fn new(gpu: &Gpu, support: usize, channels: usize, planar: bool, held: usize) -> Self {
         let constants =
@@ -53,10 +75,6 @@ impl TileKernels {
         Self { forward, adjoint: kernel("blur_tile_adjoint", BLUR_TILE_ADJOINT, 1.0) }
     }
 }
-
-/// Pixels that workgroup memory may hold, of three `f32` each: 16, 20 or 24 KiB, the least that is enough. What a workgroup takes, others that
-/// could run beside it do not have: on an H200, 24 KiB take 1.15 times as long as 16, and 32 KiB 1.8 times.
-pub(super) const HELD: [usize; 3] = [1365, 1706, 2048];
 
 /// What an operator needs to run by tiles.
 pub(super) struct Tiles {
@@ -75,11 +93,6 @@ struct Part {
     groups: usize,
     forward: wgpu::Buffer,
     adjoint: wgpu::Buffer,
-}
-
-/// Smallest and largest of `values`.
-fn range(values: impl Iterator<Item = i32>) -> (i32, i32) {
-    values.fold((i32::MAX, i32::MIN), |(a, b), v| (a.min(v), b.max(v)))
 }
 
 /// Columns and rows that the shifts of `group` read for a tile, and the smallest and the largest shift.
@@ -103,7 +116,7 @@ impl Reach {
 /// `group`, sorted, in parts whose boxes have no more than `most` pixels and whose entries fit a table.
 fn split(group: Group, most: usize, out: &mut Vec<Group>) {
     let reach = Reach::of(&group);
-    if reach.pixels() <= most && group.len() <= super::blur::GROUP_TAPS {
+    if reach.pixels() <= most && group.len() <= GROUP_TAPS {
         return out.push(group);
     }
     let across = reach.size.0 >= reach.size.1;
@@ -119,21 +132,22 @@ fn table(groups: &[(usize, Group)], adjoint: bool) -> Vec<[i32; 4]> {
     for (g, (base, taps)) in groups.iter().enumerate() {
         let reach = Reach::of(taps);
         let first = table.len() as i32;
-        // K reads base warps at p - shift, Kᵀ the frame at q + shift; both from the corner that the farthest shift reaches.
-        let corner = if adjoint {
-            let places: Group = taps.iter().map(|t| (t.0 - reach.x.0, t.1 - reach.y.0, t.2)).collect();
-            append_runs(&places, reach.size.0, &mut table);
-            [reach.x.0, reach.y.0]
-        } else {
-            let places: Group = taps.iter().rev().map(|t| (reach.x.1 - t.0, reach.y.1 - t.1, t.2)).collect();
-            append_runs(&places, reach.size.0, &mut table);
-            [-reach.x.1, -reach.y.1]
-        };
+        append_group(taps, reach.x, reach.y, reach.size.0, adjoint, &mut table);
+        let corner = if adjoint { [reach.x.0, reach.y.0] } else { [-reach.x.1, -reach.y.1] };
         let last = groups.get(g + 1).is_none_or(|next| next.0 != *base);
         table[2 * g] = [corner[0], corner[1], reach.size.0 as i32, reach.size.1 as i32];
         table[2 * g + 1] = [first, table.len() as i32, (base % BASES) as i32, i32::from(last)];
     }
     table
+}
+
+/// Rows of what K, or Kᵀ, reads whose values it uses for the rows `rows` of what it writes.
+fn rows_used(geometry: &Geometry, rows: &Range<usize>, adjoint: bool) -> Range<usize> {
+    if adjoint {
+        return geometry.rows_seen(rows);
+    }
+    let read = geometry.rows_read(rows, 0);
+    read.start as usize..read.end as usize
 }
 
 impl Tiles {
@@ -161,116 +175,75 @@ impl Tiles {
             while end < all.len() && fits(end) {
                 end += 1;
             }
-            let upload = |adjoint: bool| {
-                let mut t = table(&all[first..end], adjoint);
-                t.resize(TABLE, [0; 4]);
-                gpu.uniform("shifts", bytemuck::cast_slice(&t))
-            };
-            parts.push(Part { first_base: all[first].0, groups: end - first, forward: upload(false), adjoint: upload(true) });
+            let table = |adjoint: bool| upload(gpu, "shifts", table(&all[first..end], adjoint));
+            parts.push(Part { first_base: all[first].0, groups: end - first, forward: table(false), adjoint: table(true) });
             first = end;
         }
         Some(Self { side: side as usize, planar, held, parts })
     }
-}
-
-impl BlurKernels {
-    fn tiles(&self, gpu: &Gpu, channels: usize, tiles: &Tiles) -> &TileKernels {
-        let kernels = &self.tiles[usize::from(channels > 1)][usize::from(tiles.planar)][tiles.held];
-        kernels.get_or_init(|| TileKernels::new(gpu, self.support, channels, tiles.planar, HELD[tiles.held]))
-    }
-}
-
-impl Blur {
-    /// Rows of the latent grid whose values K uses for the frame's rows `rows`.
-    fn rows_read(&self, rows: &Range<usize>) -> Range<usize> {
-        let read = self.latent_rows(rows.start as i32 - self.shift_y.1, rows.end as i32 - self.shift_y.0, 0);
-        read.start as usize..read.end as usize
-    }
-
-    /// Rows of the frame whose values Kᵀ uses for the rows `rows` of the latent grid.
-    fn rows_seen(&self, rows: &Range<usize>) -> Range<usize> {
-        let (c, pad) = (self.centre(), self.pad as f64);
-        let x = (-pad - c.x, self.latent.0 as f64 - pad - c.x);
-        let y = (rows.start as f64 - pad - c.y, rows.end as f64 - pad - c.y);
-        let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
-        for h in &self.homographies {
-            let (a, b) = rows_of(h, x, y).unwrap_or((-1e9, 1e9));
-            (low, high) = (low.min(a), high.max(b));
-        }
-        // Other targets weigh nothing, whatever their shifts' sums are.
-        let beyond = self.support as f64 + 2.0;
-        let last = self.frame.1 as f64;
-        let low = (low + c.y - beyond + f64::from(self.shift_y.0)).clamp(0.0, last - 1.0) as usize;
-        let high = (high + c.y + beyond + f64::from(self.shift_y.1)).clamp(0.0, last) as usize;
-        low..high.max(low + 1)
-    }
 
     /// Size of what K, or Kᵀ, reads, of what it writes, and the side of a tile of that.
-    fn grids(&self, tiles: &Tiles, adjoint: bool) -> ((usize, usize), (usize, usize), usize) {
-        if adjoint { (self.frame, self.latent, tiles.side) } else { (self.latent, self.frame, SIDE) }
-    }
-
-    /// Rows of what it reads whose values it uses for the rows `rows` of what it writes.
-    fn rows_used(&self, rows: &Range<usize>, adjoint: bool) -> Range<usize> {
-        if adjoint { self.rows_seen(rows) } else { self.rows_read(rows) }
+    fn grids(&self, geometry: &Geometry, adjoint: bool) -> ((usize, usize), (usize, usize), usize) {
+        if adjoint { (geometry.frame, geometry.latent, self.side) } else { (geometry.latent, geometry.frame, SIDE) }
     }
 
     /// The bands of `rows` rows of what it writes.
-    fn tile_bands(&self, tiles: &Tiles, adjoint: bool, rows: usize) -> impl Iterator<Item = Range<usize>> + use<> {
-        let all = self.grids(tiles, adjoint).1.1;
+    fn bands(&self, geometry: &Geometry, adjoint: bool, rows: usize) -> impl Iterator<Item = Range<usize>> + use<> {
+        let all = self.grids(geometry, adjoint).1.1;
         (0..all).step_by(rows).map(move |y| y..(y + rows).min(all))
     }
 
     /// Rows that one dispatch may make: a multiple of a tile's.
-    fn tile_rows(&self, gpu: &Gpu, tiles: &Tiles, adjoint: bool) -> usize {
-        let warps = self.homographies.len() as f64 * crate::tsf::WARP_COST * (2 * self.support).pow(2) as f64;
-        let budget = gpu.dispatch_budget / ((self.taps as f64 + warps) * self.latent.0 as f64);
-        let (input, output, side) = self.grids(tiles, adjoint);
-        let fits = |r: Range<usize>| gpu.rows_fit(r.len(), output) && gpu.rows_fit(self.rows_used(&r, adjoint).len(), input);
+    fn rows(&self, gpu: &Gpu, geometry: &Geometry, adjoint: bool) -> usize {
+        let warps = geometry.homographies.len() as f64 * geometry.warp_cost();
+        let budget = gpu.dispatch_budget / ((geometry.taps as f64 + warps) * geometry.latent.0 as f64);
+        let (input, output, side) = self.grids(geometry, adjoint);
+        let fits = |r: Range<usize>| gpu.rows_fit(r.len(), output) && gpu.rows_fit(rows_used(geometry, &r, adjoint).len(), input);
         let mut rows = ((budget as usize).min(output.1.next_multiple_of(side)) / side * side).max(side);
-        while rows > side && !self.tile_bands(tiles, adjoint, rows).all(fits) {
+        while rows > side && !self.bands(geometry, adjoint, rows).all(fits) {
             rows = (rows / 2).next_multiple_of(side);
         }
         rows
     }
 
     /// Rows of either grid that the lowest bands bind at once.
-    pub(super) fn tile_rows_at_once(&self, tiles: &Tiles) -> usize {
+    pub fn rows_at_once(&self, geometry: &Geometry) -> usize {
         let used = |adjoint: bool| {
-            let bands = self.tile_bands(tiles, adjoint, self.grids(tiles, adjoint).2);
-            bands.map(move |r| self.rows_used(&r, adjoint).len())
+            let bands = self.bands(geometry, adjoint, self.grids(geometry, adjoint).2);
+            bands.map(move |r| rows_used(geometry, &r, adjoint).len())
         };
         used(false).chain(used(true)).fold(SIDE, usize::max)
     }
 
-    /// [`Blur::forward`] by tiles, or [`Blur::adjoint`].
-    pub(super) fn by_tiles(
+    /// Steps of `frame = K latent`, or of `latent += factor Kᵀ frame`.
+    pub fn steps(
         &self,
         gpu: &Gpu,
-        kernels: &BlurKernels,
-        tiles: &Tiles,
+        kernels: &TileKernels,
+        geometry: &Geometry,
+        bases: &BaseTable,
         scratch: &Scratch,
         adjoint: bool,
         from: &[wgpu::Buffer],
         to: &[wgpu::Buffer],
         factor: f32,
     ) -> Vec<Step> {
-        let kernels = kernels.tiles(gpu, scratch.channels(), tiles);
-        let (input, output, side) = self.grids(tiles, adjoint);
+        let kernels = kernels.compiled(gpu, geometry.support, scratch.channels(), self);
+        let (input, output, side) = self.grids(geometry, adjoint);
         let pair = |size: (usize, usize)| [size.0 as i32, size.1 as i32];
         let mut steps = Vec::new();
-        for rows in self.tile_bands(tiles, adjoint, self.tile_rows(gpu, tiles, adjoint)) {
-            let used = self.rows_used(&rows, adjoint);
+        for rows in self.bands(geometry, adjoint, self.rows(gpu, geometry, adjoint)) {
+            let used = rows_used(geometry, &rows, adjoint);
             let ([r, g, b], in_first) = scratch.rows(gpu, from, input, used.clone(), false);
             let ([x, y, z], out_first) = scratch.rows(gpu, to, output, rows.clone(), true);
-            for (p, part) in tiles.parts.iter().enumerate() {
+            for (p, part) in self.parts.iter().enumerate() {
                 let params = TileParams {
                     in_size: pair(input),
                     in_rows: pair((used.start, used.end)),
                     out_size: pair(output),
                     rows: pair((rows.start, rows.end)),
-                    pad: [self.pad as i32; 2],
-                    centre: self.centre().as_vec2().to_array(),
+                    pad: [geometry.pad as i32; 2],
+                    centre: geometry.centre().as_vec2().to_array(),
                     in_first,
                     out_first,
                     groups: part.groups as i32,
@@ -281,7 +254,7 @@ impl Blur {
                 let (kernel, table) =
                     if adjoint { (&kernels.adjoint, &part.adjoint) } else { (&kernels.forward[usize::from(p > 0)], &part.forward) };
                 let table = table.as_entire_binding();
-                let bound = [self.bases(part.first_base), table, x.clone(), y.clone(), z.clone(), r.clone(), g.clone(), b.clone()];
+                let bound = [bases.around(part.first_base), table, x.clone(), y.clone(), z.clone(), r.clone(), g.clone(), b.clone()];
                 steps.push(kernel.step_parts(gpu, &params, &bound, grid(pair((output.0, rows.len())), (side, side), 1)));
             }
         }

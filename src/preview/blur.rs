@@ -1,7 +1,7 @@
 //! The blur view: patches and their PSFs on the picture, a grid of PSFs, the camera's motion as a path and in its own space.
 
-use super::app::App;
 use super::canvas::Layout;
+use super::state::{Over, State};
 use super::worker::Solved;
 use crate::image::Plane;
 use crate::pose::project;
@@ -16,30 +16,12 @@ const PATCH: f32 = 96.0;
 /// Points within which the pointer takes hold of a patch.
 const GRIP: f32 = 14.0;
 
-/// What the blur view shows.
-pub struct State {
-    /// Whether it is open.
-    pub open: bool,
-    /// Patches and their measured PSFs.
-    pub patches: bool,
-    /// The grid of PSFs.
-    pub grid: bool,
-    /// The camera's path at five points.
-    pub path: bool,
-    /// Times that paths and PSFs are drawn larger than they are.
-    pub magnified: f32,
-    /// Turn of the plot, radians: about the vertical, and up.
-    pub turn: (f32, f32),
+/// What the view keeps between frames of the window.
+#[derive(Default)]
+pub struct Drawn {
     /// The patch that is being dragged.
     dragged: Option<usize>,
     glyphs: Option<Glyphs>,
-}
-
-impl State {
-    /// The view, open or not.
-    pub fn new(open: bool) -> Self {
-        Self { open, patches: true, grid: true, path: false, magnified: 3.0, turn: (0.7, 0.45), dragged: None, glyphs: None }
-    }
 }
 
 /// PSFs as textures, for one frame of one solution.
@@ -98,8 +80,8 @@ pub fn psf_at(tsf: &Tsf, p: DVec2, radius: usize) -> Plane {
     psf
 }
 
-fn glyphs(app: &App, ctx: &egui::Context, solved: &Solved, frame: usize) -> Glyphs {
-    let of = (app.solutions, frame);
+fn glyphs(state: &State, ctx: &egui::Context, solved: &Solved, frame: usize) -> Glyphs {
+    let of = (state.solutions, frame);
     let (w, h) = solved.bracket.size();
     let scale = solved.divisor as f32;
     let smooth = egui::TextureOptions::LINEAR;
@@ -143,22 +125,22 @@ fn glyphs(app: &App, ctx: &egui::Context, solved: &Solved, frame: usize) -> Glyp
 }
 
 /// The frame whose blur is shown: the chosen one, or else the first that is blurred.
-fn subject(app: &App) -> Option<usize> {
-    let solved = app.solved.as_ref()?;
+fn subject(state: &State) -> Option<usize> {
+    let solved = state.solved.as_ref()?;
     let blurred = |i: &usize| solved.tsf(*i).is_some();
-    Some(app.frame).filter(blurred).or_else(|| (0..solved.bracket.frames().len()).find(blurred))
+    Some(state.frame).filter(blurred).or_else(|| (0..solved.bracket.frames().len()).find(blurred))
 }
 
 /// The user's patch nearest to `at` on the screen.
-fn grasped(app: &App, layout: &Layout, at: Pos2) -> Option<usize> {
+fn grasped(state: &State, layout: &Layout, at: Pos2) -> Option<usize> {
     let place = |p: &(usize, usize)| layout.to_screen(Vec2::new(p.0 as f32 + 0.5, p.1 as f32 + 0.5));
-    let near = app.session.patches.iter().enumerate().map(|(i, p)| (i, place(p).distance(at)));
+    let near = state.session.patches.iter().enumerate().map(|(i, p)| (i, place(p).distance(at)));
     near.filter(|n| n.1 < GRIP).min_by(|a, b| a.1.total_cmp(&b.1)).map(|n| n.0)
 }
 
 /// Adds, moves and removes patches; whether the pointer has one in hand.
-pub fn wants_pointer(app: &mut App, ui: &egui::Ui, response: &egui::Response, layout: &Layout) -> bool {
-    let Some(size) = app.size() else { return false };
+pub fn wants_pointer(state: &mut State, drawn: &mut Drawn, ui: &egui::Ui, response: &egui::Response, layout: &Layout) -> bool {
+    let Some(size) = state.size() else { return false };
     let pixel = |at: Pos2| {
         let q = layout.to_frame(at);
         let inside = q.x >= 0.0 && q.y >= 0.0 && q.x < size.x && q.y < size.y;
@@ -166,48 +148,48 @@ pub fn wants_pointer(app: &mut App, ui: &egui::Ui, response: &egui::Response, la
     };
     if response.drag_started() {
         let origin = ui.input(|i| i.pointer.press_origin());
-        app.blur.dragged = origin.and_then(|at| grasped(app, layout, at));
+        drawn.dragged = origin.and_then(|at| grasped(state, layout, at));
     }
     let at = response.interact_pointer_pos();
-    if let (Some(i), Some(at)) = (app.blur.dragged, at)
+    if let (Some(i), Some(at)) = (drawn.dragged, at)
         && response.dragged()
         && let Some(to) = pixel(at)
-        && let Some(patch) = app.session.patches.get_mut(i)
+        && let Some(patch) = state.session.patches.get_mut(i)
     {
         *patch = to;
     }
     if response.drag_stopped() {
-        app.blur.dragged = None;
+        drawn.dragged = None;
     }
     if response.clicked()
         && !response.double_clicked()
-        && app.blur.patches
+        && state.blur.patches
         && let Some(at) = at
-        && grasped(app, layout, at).is_none()
+        && grasped(state, layout, at).is_none()
         && let Some(to) = pixel(at)
     {
-        app.session.patches.push(to);
+        state.session.patches.push(to);
     }
     if response.secondary_clicked()
         && let Some(at) = at
-        && let Some(i) = grasped(app, layout, at)
+        && let Some(i) = grasped(state, layout, at)
     {
-        app.session.patches.remove(i);
+        state.session.patches.remove(i);
     }
-    app.blur.dragged.is_some()
+    drawn.dragged.is_some()
 }
 
 /// Draws patches, PSFs and paths over the picture.
-pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, layout: &Layout) {
-    let (Some(size), Some(solved), Some(frame)) = (app.size(), app.solved.clone(), subject(app)) else { return };
-    if app.blur.glyphs.as_ref().is_none_or(|g| g.of != (app.solutions, frame)) {
-        app.blur.glyphs = Some(glyphs(app, ui.ctx(), &solved, frame));
+pub fn over_picture(state: &State, drawn: &mut Drawn, ui: &egui::Ui, response: &egui::Response, layout: &Layout) {
+    let (Some(size), Some(solved), Some(frame)) = (state.size(), state.solved.clone(), subject(state)) else { return };
+    if drawn.glyphs.as_ref().is_none_or(|g| g.of != (state.solutions, frame)) {
+        drawn.glyphs = Some(glyphs(state, ui.ctx(), &solved, frame));
     }
-    let Some(glyphs) = &app.blur.glyphs else { return };
+    let Some(glyphs) = &drawn.glyphs else { return };
     let painter = ui.painter_at(layout.rect);
     let uv = Rect::from_min_max(Pos2::ZERO, Pos2::new(1.0, 1.0));
     let shade = |place: Rect| painter.rect_filled(place, 3.0, Color32::from_black_alpha(150));
-    if app.blur.grid
+    if state.blur.grid
         && let Some(grid) = &glyphs.grid
     {
         let (nx, ny) = grid.cells;
@@ -215,7 +197,7 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
         for j in 0..ny {
             for i in 0..nx {
                 let centre = layout.to_screen(Vec2::new((i as f32 + 0.5) * cell.x, (j as f32 + 0.5) * cell.y));
-                let side = (grid.across * app.blur.magnified * layout.zoom).min(0.9 * cell.min_elem() * layout.zoom);
+                let side = (grid.across * state.blur.magnified * layout.zoom).min(0.9 * cell.min_elem() * layout.zoom);
                 let place = Rect::from_center_size(centre, Vec2::splat(side));
                 let at = Pos2::new(i as f32 / nx as f32, j as f32 / ny as f32);
                 let part = Rect::from_min_size(at, Vec2::new(1.0 / nx as f32, 1.0 / ny as f32));
@@ -224,13 +206,13 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
             }
         }
     }
-    if app.blur.patches {
+    if state.blur.patches {
         for p in &glyphs.patches {
             let place = Rect::from_min_max(layout.to_screen(p.corner), layout.to_screen(p.corner + Vec2::splat(p.side)));
             let colour = if p.confidence > 0.5 { Color32::from_rgb(110, 230, 130) } else { Color32::from_rgb(240, 180, 60) };
             painter.rect_stroke(place, 2.0, Stroke::new(1.5, colour), egui::StrokeKind::Inside);
-            if !app.blur.grid {
-                let side = (p.across * app.blur.magnified * layout.zoom).min(0.85 * place.width());
+            if !state.blur.grid {
+                let side = (p.across * state.blur.magnified * layout.zoom).min(0.85 * place.width());
                 let inner = Rect::from_center_size(place.center(), Vec2::splat(side));
                 shade(inner);
                 painter.image(p.texture.id(), inner, uv, Color32::WHITE);
@@ -241,8 +223,8 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
                 painter.text(place.left_bottom() + Vec2::new(4.0, -3.0), egui::Align2::LEFT_BOTTOM, text, font, colour);
             }
         }
-        let hovered = response.hover_pos().and_then(|at| grasped(app, layout, at));
-        for (i, p) in app.session.patches.iter().enumerate() {
+        let hovered = response.hover_pos().and_then(|at| grasped(state, layout, at));
+        for (i, p) in state.session.patches.iter().enumerate() {
             let at = layout.to_screen(Vec2::new(p.0 as f32 + 0.5, p.1 as f32 + 0.5));
             let side = PATCH.min(0.5 * size.min_elem()) * layout.zoom;
             let own = Color32::from_rgb(110, 190, 255);
@@ -251,7 +233,7 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
             painter.circle(at, 5.0, Color32::from_black_alpha(140), Stroke::new(width, own));
         }
     }
-    if app.blur.path
+    if state.blur.path
         && let Some(tsf) = solved.tsf(frame)
     {
         let (w, h) = solved.bracket.size();
@@ -265,7 +247,7 @@ pub fn over_picture(app: &mut App, ui: &egui::Ui, response: &egui::Response, lay
                 .poses
                 .iter()
                 .map(|pose| {
-                    let u = (project(&(pose.homography(tsf.focal_px) * tsf.base), p) - middle) * scale * f64::from(app.blur.magnified);
+                    let u = (project(&(pose.homography(tsf.focal_px) * tsf.base), p) - middle) * scale * f64::from(state.blur.magnified);
                     layout.to_screen(origin + Vec2::new(u.x as f32, u.y as f32))
                 })
                 .collect();
@@ -309,13 +291,13 @@ fn path(painter: &egui::Painter, places: &[Pos2], tsf: &Tsf) {
 }
 
 /// The side panel of the blur view.
-pub fn panel(app: &mut App, ui: &mut egui::Ui) {
+pub fn panel(state: &mut State, ui: &mut egui::Ui) {
     ui.add_space(6.0);
-    let Some(solved) = app.solved.clone() else {
+    let Some(solved) = state.solved.clone() else {
         ui.weak("The blur is shown once the frames are solved");
         return;
     };
-    let Some(frame) = subject(app) else {
+    let Some(frame) = subject(state) else {
         ui.label("No frame of this bracket is blurred, or none could be explained");
         return;
     };
@@ -324,13 +306,13 @@ pub fn panel(app: &mut App, ui: &mut egui::Ui) {
     ui.horizontal(|ui| {
         for i in blurred {
             if ui.selectable_label(i == frame, format!("Frame {}", i + 1)).clicked() {
-                app.choose(i);
+                state.choose(i);
             }
         }
     });
     let entry = &solved.outcome.report["frames"][frame];
     if let Some(tsf) = solved.tsf(frame) {
-        plot(app, ui, &tsf, solved.divisor as f64);
+        plot(state, ui, &tsf, solved.divisor as f64);
         ui.label(RichText::new("Drag to turn. A dot is a pose; its size, the time spent there").small().weak());
         let (w, h) = solved.bracket.size();
         let extent = crate::tsf::extent(&tsf, w, h) * solved.divisor as f64;
@@ -340,30 +322,30 @@ pub fn panel(app: &mut App, ui: &mut egui::Ui) {
     if let Some(chi) = entry["chi_squared"].as_f64() {
         ui.label(format!("Residual: {chi:.2} times what noise explains"));
     }
-    ui.checkbox(&mut app.blur.grid, "PSF grid");
-    ui.checkbox(&mut app.blur.patches, "Patches");
-    ui.checkbox(&mut app.blur.path, "Camera path");
-    ui.add(egui::Slider::new(&mut app.blur.magnified, 1.0..=20.0).logarithmic(true).text("Magnified"));
-    let mut residual = app.over == super::app::Over::Residual;
+    ui.checkbox(&mut state.blur.grid, "PSF grid");
+    ui.checkbox(&mut state.blur.patches, "Patches");
+    ui.checkbox(&mut state.blur.path, "Camera path");
+    ui.add(egui::Slider::new(&mut state.blur.magnified, 1.0..=20.0).logarithmic(true).text("Magnified"));
+    let mut residual = state.over == Over::Residual;
     if ui.checkbox(&mut residual, "Residual map").changed() {
-        app.over = if residual { super::app::Over::Residual } else { super::app::Over::Nothing };
-        app.choose(frame);
+        state.over = if residual { Over::Residual } else { Over::Nothing };
+        state.choose(frame);
     }
     ui.label(RichText::new("Click: add a patch. Drag: move it. Right click: remove it").small().weak());
-    if ui.add_enabled(!app.session.patches.is_empty(), egui::Button::new("Remove all patches")).clicked() {
-        app.session.patches.clear();
+    if ui.add_enabled(!state.session.patches.is_empty(), egui::Button::new("Remove all patches")).clicked() {
+        state.session.patches.clear();
     }
 }
 
 /// The TSF in (t_x, t_y, θ_z), to be turned by dragging.
-fn plot(app: &mut App, ui: &mut egui::Ui, tsf: &Tsf, scale: f64) {
+fn plot(state: &mut State, ui: &mut egui::Ui, tsf: &Tsf, scale: f64) {
     let side = ui.available_width().min(300.0);
     let (rect, response) = ui.allocate_exact_size(Vec2::new(side, 0.85 * side), Sense::drag());
     response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Image, true, "Camera motion in shift and roll"));
     if response.dragged() {
         let d = response.drag_delta();
-        app.blur.turn.0 += 0.01 * d.x;
-        app.blur.turn.1 = (app.blur.turn.1 + 0.01 * d.y).clamp(-1.5, 1.5);
+        state.blur.turn.0 += 0.01 * d.x;
+        state.blur.turn.1 = (state.blur.turn.1 + 0.01 * d.y).clamp(-1.5, 1.5);
     }
     let painter = ui.painter_at(rect);
     painter.rect_filled(rect, 4.0, ui.visuals().extreme_bg_color);
@@ -377,7 +359,7 @@ fn plot(app: &mut App, ui: &mut egui::Ui, tsf: &Tsf, scale: f64) {
     // Both shifts in one unit; the roll in its own.
     let pixels = nice(reach(0).max(reach(1)).max(0.5));
     let degrees = nice(reach(2).max(0.01));
-    let (yaw, pitch) = app.blur.turn;
+    let (yaw, pitch) = state.blur.turn;
     let place = |v: [f64; 3]| {
         let (x, y, z) = ((v[0] / pixels) as f32, (v[1] / pixels) as f32, (v[2] / degrees) as f32);
         let (u, depth) = (x * yaw.cos() - y * yaw.sin(), x * yaw.sin() + y * yaw.cos());

@@ -1,9 +1,10 @@
 //! The menu and the panel at the side: what is shown, look, histogram, probe, parameters.
 
-use super::app::{App, Over, Source};
+use super::session::{Look, Parameters};
 use super::shortcuts::{self, Action};
+use super::state::{Over, Source, State};
 use super::worker::BINS_PER_STOP;
-use super::{blur, export, strip};
+use super::{blur, export, words};
 use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::mask;
@@ -17,7 +18,7 @@ pub fn bare(ui: &egui::Ui) -> egui::Frame {
 }
 
 /// The menu; returns what was chosen.
-pub fn menu(app: &mut App, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec<Action> {
+pub fn menu(state: &mut State, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec<Action> {
     let mut chosen = Vec::new();
     let mut open = None;
     egui::Panel::top("menu").frame(bare(ui)).show(ui, |ui| {
@@ -29,18 +30,18 @@ pub fn menu(app: &mut App, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec
                     ui.close();
                 }
             };
-            let frames = !app.session.shots.is_empty();
+            let frames = !state.session.shots.is_empty();
             ui.menu_button("File", |ui| {
                 item(ui, "Open...", Action::Open, true);
                 if ui.button("Add frames...").clicked() {
-                    export::choose_frames(app, true);
+                    export::choose_frames(state, true);
                     ui.close();
                 }
                 ui.menu_button("Open recent", |ui| {
-                    if app.recent.entries.is_empty() {
+                    if state.recent.entries.is_empty() {
                         ui.weak("nothing yet");
                     }
-                    for files in &app.recent.entries {
+                    for files in &state.recent.entries {
                         let name = |p: &std::path::PathBuf| p.file_name().unwrap_or(p.as_os_str()).to_string_lossy().into_owned();
                         let text = match files.as_slice() {
                             [one] => name(one),
@@ -57,7 +58,7 @@ pub fn menu(app: &mut App, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec
                 item(ui, "Export...", Action::Export, frames);
                 item(ui, "Copy command line", Action::CopyCommand, frames);
                 if ui.add_enabled(frames, egui::Button::new("Copy configuration (TOML)")).clicked() {
-                    ui.ctx().copy_text(app.session.configuration(&app.noted()));
+                    ui.ctx().copy_text(state.session.configuration(&state.noted()));
                     ui.close();
                 }
             });
@@ -76,19 +77,19 @@ pub fn menu(app: &mut App, ui: &mut egui::Ui, (undo, redo): (bool, bool)) -> Vec
             });
             ui.menu_button("Help", |ui| item(ui, "Keyboard shortcuts", Action::Help, true));
             ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
-                if app.running.is_none() && ui.add_enabled(app.session.shots.len() > 1, egui::Button::new("Solve")).clicked() {
+                if state.running.is_none() && ui.add_enabled(state.session.shots.len() > 1, egui::Button::new("Solve")).clicked() {
                     chosen.push(Action::Solve);
                 }
-                if ui.add_enabled(app.solved.is_some(), egui::Button::new("Export")).clicked() {
+                if ui.add_enabled(state.solved.is_some(), egui::Button::new("Export")).clicked() {
                     chosen.push(Action::Export);
                 }
-                ui.selectable_value(&mut app.blur.open, true, "Blur");
-                ui.selectable_value(&mut app.blur.open, false, "Picture");
+                ui.selectable_value(&mut state.blur.open, true, "Blur");
+                ui.selectable_value(&mut state.blur.open, false, "Picture");
             });
         });
     });
     if let Some(files) = open {
-        app.open(files);
+        state.open(files);
     }
     chosen
 }
@@ -100,61 +101,61 @@ fn heading(ui: &mut egui::Ui, text: &str) {
 }
 
 /// The panel.
-pub fn panel(app: &mut App, ui: &mut egui::Ui) {
+pub fn panel(state: &mut State, ui: &mut egui::Ui) {
     egui::Panel::right("panel").frame(bare(ui)).default_size(300.0).size_range(260.0..=460.0).show(ui, |ui| {
         egui::ScrollArea::vertical().auto_shrink([false, false]).show(ui, |ui| {
             ui.spacing_mut().slider_width = 130.0;
-            if app.blur.open {
-                blur::panel(app, ui);
+            if state.blur.open {
+                blur::panel(state, ui);
             } else {
-                histogram(app, ui);
-                look(app, ui);
+                histogram(state, ui);
+                look(state, ui);
             }
-            compare(app, ui);
-            parameters(app, ui);
-            if !app.blur.open {
-                probe(app, ui);
+            compare(state, ui);
+            parameters(state, ui);
+            if !state.blur.open {
+                probe(state, ui);
             }
         });
     });
 }
 
-fn compare(app: &mut App, ui: &mut egui::Ui) {
+fn compare(state: &mut State, ui: &mut egui::Ui) {
     heading(ui, "Compare");
-    let frames = app.session.shots.len();
-    ui.checkbox(&mut app.view.divided, "Divider");
+    let frames = state.session.shots.len();
+    ui.checkbox(&mut state.view.divided, "Divider");
     for (label, before) in [("Before", true), ("After", false)] {
-        let mut source = if before { app.before } else { app.after };
-        egui::ComboBox::from_label(label).width(150.0).selected_text(app.source_name(source)).show_ui(ui, |ui| {
+        let mut source = if before { state.before } else { state.after };
+        egui::ComboBox::from_label(label).width(150.0).selected_text(state.source_name(source)).show_ui(ui, |ui| {
             ui.selectable_value(&mut source, Source::Merge, "Plain merge");
             ui.selectable_value(&mut source, Source::Result, "Result");
             for i in 0..frames {
                 ui.selectable_value(&mut source, Source::Frame(i), format!("Frame {}", i + 1));
             }
         });
-        *(if before { &mut app.before } else { &mut app.after }) = source;
+        *(if before { &mut state.before } else { &mut state.after }) = source;
     }
-    egui::ComboBox::from_label("Overlay").width(150.0).selected_text(app.over.name()).show_ui(ui, |ui| {
+    egui::ComboBox::from_label("Overlay").width(150.0).selected_text(state.over.name()).show_ui(ui, |ui| {
         for over in Over::ALL {
-            ui.selectable_value(&mut app.over, over, over.name());
+            ui.selectable_value(&mut state.over, over, over.name());
         }
     });
-    let meaning = match app.over {
+    let meaning = match state.over {
         Over::Nothing => String::new(),
-        Over::FrameClipped => format!("Striped: frame {} is clipped", app.frame + 1),
+        Over::FrameClipped => format!("Striped: frame {} is clipped", state.frame + 1),
         Over::AllClipped => "Striped: clipped in every frame; nothing there is known beyond that it is brighter".into(),
-        Over::Mask => format!("Red: frame {} does not count there", app.frame + 1),
-        Over::Residual => format!("Bright: frame {} is not explained (dark: noise, yellow: 16 times its variance)", app.frame + 1),
+        Over::Mask => format!("Red: frame {} does not count there", state.frame + 1),
+        Over::Residual => format!("Bright: frame {} is not explained (dark: noise, yellow: 16 times its variance)", state.frame + 1),
     };
     if !meaning.is_empty() {
         ui.label(RichText::new(meaning).small());
     }
-    ui.checkbox(&mut app.extremes, "Mark what the tone curve clips");
+    ui.checkbox(&mut state.extremes, "Mark what the tone curve clips");
 }
 
-fn look(app: &mut App, ui: &mut egui::Ui) {
+fn look(state: &mut State, ui: &mut egui::Ui) {
     heading(ui, "Look");
-    let look = &mut app.session.look;
+    let look = &mut state.session.look;
     ui.add(Slider::new(&mut look.exposure, -6.0..=6.0).text("Exposure, EV").step_by(0.05));
     egui::ComboBox::from_label("Tone curve").width(110.0).selected_text(look.curve.clone()).show_ui(ui, |ui| {
         for name in Operator::names() {
@@ -168,15 +169,15 @@ fn look(app: &mut App, ui: &mut egui::Ui) {
     let key = Slider::new(&mut look.key, 0.02..=0.6).text("Brightness of the middle").step_by(0.005);
     ui.add_enabled(keyed, key);
     if ui.button("Reset the look").clicked() {
-        *look = super::session::Look::default();
+        *look = Look::default();
     }
 }
 
-fn parameters(app: &mut App, ui: &mut egui::Ui) {
+fn parameters(state: &mut State, ui: &mut egui::Ui) {
     heading(ui, "Solve");
-    let frames = app.session.shots.len();
-    let p = &mut app.session.parameters;
-    ui.checkbox(&mut app.live, "Solve after each edit");
+    let frames = state.session.shots.len();
+    let p = &mut state.session.parameters;
+    ui.checkbox(&mut state.live, "Solve after each edit");
     ui.add(Slider::new(&mut p.lambda, 0.1..=20.0).logarithmic(true).text("Smoothness, lambda").max_decimals(2))
         .on_hover_text("More is smoother, less keeps more noise and detail");
     egui::ComboBox::from_label("Prior").width(130.0).selected_text(p.prior.clone()).show_ui(ui, |ui| {
@@ -223,37 +224,37 @@ fn parameters(app: &mut App, ui: &mut egui::Ui) {
         .on_hover_text("Where something moved between sharp frames, the one that shows it best counts alone");
     ui.horizontal(|ui| {
         let label = ui.label("Response");
-        let edit = egui::TextEdit::singleline(&mut app.typed_response).desired_width(120.0).hint_text("as the files say");
+        let edit = egui::TextEdit::singleline(&mut state.typed_response).desired_width(120.0).hint_text("as the files say");
         let response =
             ui.add(edit).labelled_by(label.id).on_hover_text("auto, srgb, linear, gamma:2.2 or a file from 'unshaken calibrate'");
         if response.lost_focus() {
-            p.response = app.typed_response.trim().to_string();
+            p.response = state.typed_response.trim().to_string();
         } else if !response.has_focus() {
-            app.typed_response.clone_from(&p.response);
+            state.typed_response.clone_from(&p.response);
         }
     });
     ui.horizontal(|ui| {
         let label = ui.label("GPU memory");
-        let edit = egui::TextEdit::singleline(&mut app.typed_memory).desired_width(120.0).hint_text("all there is");
+        let edit = egui::TextEdit::singleline(&mut state.typed_memory).desired_width(120.0).hint_text("all there is");
         let response = ui.add(edit).labelled_by(label.id).on_hover_text("At most this much, such as 2GiB; less is slower");
         if response.lost_focus() {
-            p.memory_limit = app.typed_memory.trim().to_string();
+            p.memory_limit = state.typed_memory.trim().to_string();
         } else if !response.has_focus() {
-            app.typed_memory.clone_from(&p.memory_limit);
+            state.typed_memory.clone_from(&p.memory_limit);
         }
     });
     if ui.button("Reset the parameters").clicked() {
-        *p = super::session::Parameters::default();
+        *p = Parameters::default();
     }
 }
 
-fn histogram(app: &App, ui: &mut egui::Ui) {
+fn histogram(state: &State, ui: &mut egui::Ui) {
     heading(ui, "Histogram");
     let (rect, response) = ui.allocate_exact_size(Vec2::new(ui.available_width(), 96.0), egui::Sense::hover());
     response.widget_info(|| egui::WidgetInfo::labeled(egui::Role::Image, true, "Histogram of the irradiance"));
     let painter = ui.painter_at(rect);
     painter.rect_filled(rect, 3.0, ui.visuals().extreme_bg_color);
-    let found = app.solved.as_ref().map(|s| &s.histogram).or(app.ready.as_ref().map(|r| &r.histogram));
+    let found = state.solved.as_ref().map(|s| &s.histogram).or(state.ready.as_ref().map(|r| &r.histogram));
     let Some(h) = found else { return };
     let count = h.bins[0].len().max(1);
     let most = h.bins.iter().flatten().copied().fold(1e-9f32, f32::max).sqrt();
@@ -267,7 +268,7 @@ fn histogram(app: &App, ui: &mut egui::Ui) {
     };
     let weak = Stroke::new(1.0, ui.visuals().weak_text_color().gamma_multiply(0.35));
     // White of the reference frame is 0 EV.
-    let white = app.solved.as_ref().map(|s| -(s.bracket.frames()[s.outcome.reference].exposure_time as f32).log2());
+    let white = state.solved.as_ref().map(|s| -(s.bracket.frames()[s.outcome.reference].exposure_time as f32).log2());
     let zero = white.unwrap_or(h.first + (count / BINS_PER_STOP) as f32);
     for stop in (-24..=24).step_by(2) {
         let bin = (zero + stop as f32 - h.first) * BINS_PER_STOP as f32;
@@ -291,7 +292,7 @@ fn histogram(app: &App, ui: &mut egui::Ui) {
         painter.add(egui::Shape::line(points, Stroke::new(1.5, colour)));
     }
     // What the screen shows: from where the curve leaves black to where it is white.
-    if let (Some(light), Ok(operator)) = (app.light(), Operator::parse(&app.session.look.words()))
+    if let (Some(light), Ok(operator)) = (state.light(), Operator::parse(&state.session.look.words()))
         && let Some(curve) = operator.curve(&light)
     {
         let top = (curve.white / curve.gain).log2();
@@ -330,13 +331,13 @@ fn masks_at(frames: &[Frame], sharp: &[bool], alpha: f32, pixel: usize) -> Vec<f
     mask::counting(&ones, sharp, alpha, &still).iter().map(|m| m.data[0]).collect()
 }
 
-fn probe(app: &App, ui: &mut egui::Ui) {
+fn probe(state: &State, ui: &mut egui::Ui) {
     heading(ui, "Pixel");
-    let Some(ready) = &app.ready else {
+    let Some(ready) = &state.ready else {
         ui.weak("Point at the picture");
         return;
     };
-    let Some((x, y)) = app.probe else {
+    let Some((x, y)) = state.probe else {
         ui.weak("Point at the picture");
         return;
     };
@@ -344,7 +345,7 @@ fn probe(app: &App, ui: &mut egui::Ui) {
     let pixel = y * ready.opened.bracket.size().0 + x;
     ui.monospace(format!("at {x}, {y}"));
     egui::Grid::new("probe").num_columns(4).spacing([10.0, 2.0]).striped(true).show(ui, |ui| {
-        if let Some(s) = &app.solved {
+        if let Some(s) = &state.solved {
             let (w, h) = s.bracket.size();
             let (u, v) = ((x / s.divisor).min(w - 1), (y / s.divisor).min(h - 1));
             ui.label("irradiance");
@@ -353,11 +354,11 @@ fn probe(app: &App, ui: &mut egui::Ui) {
             }
             ui.end_row();
         }
-        let report = app.solved.as_ref().map(|s| &s.outcome.report["frames"]);
+        let report = state.solved.as_ref().map(|s| &s.outcome.report["frames"]);
         let sharp: Vec<bool> = (0..frames.len()).map(|i| report.is_none_or(|r| r[i]["sharp"] == true)).collect();
-        let masks = masks_at(frames, &sharp, app.session.parameters.alpha as f32, pixel);
+        let masks = masks_at(frames, &sharp, state.session.parameters.alpha as f32, pixel);
         for (i, frame) in frames.iter().enumerate() {
-            ui.label(format!("{} at {}", i + 1, strip::time(frame.exposure_time)));
+            ui.label(format!("{} at {}", i + 1, words::time(frame.exposure_time)));
             for z in frame.intensity.pixel(pixel) {
                 let text = RichText::new(format!("{:.1}", 255.0 * z)).monospace();
                 ui.label(if z >= mask::CLIPPED { text.color(ui.visuals().warn_fg_color) } else { text });
@@ -366,7 +367,7 @@ fn probe(app: &App, ui: &mut egui::Ui) {
             ui.end_row();
         }
     });
-    let unit = app.solved.as_ref().map_or("code values of 255".to_string(), |s| {
+    let unit = state.solved.as_ref().map_or("code values of 255".to_string(), |s| {
         format!("irradiance: 1 is the white of frame {}; frames: codes of 255", s.outcome.reference + 1)
     });
     ui.label(RichText::new(unit).small().weak());

@@ -1,7 +1,7 @@
 //! Files in and out: dialogs, and the window for exports.
 
-use super::app::{App, ExportForm};
-use super::{Chosen, worker::News};
+use super::state::{ExportForm, State};
+use super::worker::{Chosen, News};
 use crate::io::output;
 use egui::RichText;
 use std::ffi::OsString;
@@ -14,8 +14,8 @@ const FRAMES: [&str; 20] = [
 ];
 
 /// Lets the user choose frames, or a session, to open or (`add`) to add.
-pub fn choose_frames(app: &App, add: bool) {
-    app.workers.beside(move |tell| {
+pub fn choose_frames(state: &State, add: bool) {
+    state.workers.beside(move |tell| {
         let dialog = rfd::FileDialog::new()
             .set_title("Frames of one bracket, or a session")
             .add_filter("Frames and sessions", &[&FRAMES[..], &["json"]].concat())
@@ -27,12 +27,12 @@ pub fn choose_frames(app: &App, add: bool) {
 }
 
 /// Saves the session where it was saved before, or asks.
-pub fn save(app: &mut App) {
-    if let Some(path) = app.saved.clone() {
-        return app.save_to(&path);
+pub fn save(state: &mut State) {
+    if let Some(path) = state.saved.clone() {
+        return state.save_to(&path);
     }
-    let folder = app.session.shots.first().and_then(|s| s.path.parent()).map(Path::to_path_buf).unwrap_or_default();
-    app.workers.beside(move |tell| {
+    let folder = state.session.shots.first().and_then(|s| s.path.parent()).map(Path::to_path_buf).unwrap_or_default();
+    state.workers.beside(move |tell| {
         let dialog = rfd::FileDialog::new().set_title("Save the session").set_directory(folder).set_file_name("bracket.unshaken.json");
         if let Some(path) = dialog.save_file() {
             tell(News::Chosen(Chosen::Session(path)));
@@ -40,9 +40,9 @@ pub fn save(app: &mut App) {
     });
 }
 
-fn ask_target(app: &App) {
-    let start = PathBuf::from(&app.form.path);
-    app.workers.beside(move |tell| {
+fn ask_target(state: &State) {
+    let start = PathBuf::from(&state.form.path);
+    state.workers.beside(move |tell| {
         let mut dialog = rfd::FileDialog::new()
             .set_title("Export the linear result")
             .add_filter("OpenEXR", &["exr"])
@@ -84,67 +84,67 @@ impl ExportForm {
 }
 
 /// Arguments of `merge` for what the form asks.
-pub fn arguments(app: &App) -> Vec<OsString> {
-    let mut all = app.session.arguments(&app.noted(), Path::new(&app.form.path));
+pub fn arguments(state: &State) -> Vec<OsString> {
+    let mut all = state.session.arguments(&state.noted(), Path::new(&state.form.path));
     let at = all.iter().position(|a| a == "--").unwrap_or(all.len());
-    all.splice(at..at, app.form.options(&app.session.look.words()));
+    all.splice(at..at, state.form.options(&state.session.look.words()));
     all
 }
 
 /// The window for exports.
-pub fn window(app: &mut App, ctx: &egui::Context) {
-    let mut open = app.form.open;
+pub fn window(state: &mut State, ctx: &egui::Context) {
+    let mut open = state.form.open;
     egui::Window::new("Export").open(&mut open).resizable(false).collapsible(false).default_width(420.0).default_pos([120.0, 90.0]).show(
         ctx,
         |ui| {
             ui.horizontal(|ui| {
                 let label = ui.label("Linear result");
-                ui.add(egui::TextEdit::singleline(&mut app.form.path).desired_width(240.0)).labelled_by(label.id);
+                ui.add(egui::TextEdit::singleline(&mut state.form.path).desired_width(240.0)).labelled_by(label.id);
                 if ui.button("Browse...").clicked() {
-                    ask_target(app);
+                    ask_target(state);
                 }
             });
             ui.label(RichText::new("OpenEXR, TIFF or Radiance HDR, by the ending: .exr, .tif, .hdr").small().weak());
-            ui.checkbox(&mut app.form.picture, "Picture as shown (PNG)");
-            ui.checkbox(&mut app.form.report, "Report (JSON)");
-            ui.checkbox(&mut app.form.page, "Report page (HTML)");
-            ui.checkbox(&mut app.form.half, "16 bits instead of 32");
-            ui.checkbox(&mut app.form.overwrite, "Replace files that exist");
-            let ending = output::ending(Path::new(&app.form.path));
+            ui.checkbox(&mut state.form.picture, "Picture as shown (PNG)");
+            ui.checkbox(&mut state.form.report, "Report (JSON)");
+            ui.checkbox(&mut state.form.page, "Report page (HTML)");
+            ui.checkbox(&mut state.form.half, "16 bits instead of 32");
+            ui.checkbox(&mut state.form.overwrite, "Replace files that exist");
+            let ending = output::ending(Path::new(&state.form.path));
             let known = ["exr", "tif", "tiff", "hdr"].contains(&ending.as_str());
-            let able = app.is_final() && known && !app.form.busy;
+            let able = state.is_final() && known && !state.form.busy;
             ui.horizontal(|ui| {
                 if ui.add_enabled(able, egui::Button::new("Write the files")).clicked()
-                    && let Some(solved) = app.solved.clone()
+                    && let Some(solved) = state.solved.clone()
                 {
-                    app.form.busy = true;
-                    app.form.last = None;
-                    app.workers.write(app.program.clone(), arguments(app), solved);
+                    state.form.busy = true;
+                    state.form.last = None;
+                    state.workers.write(state.program.clone(), arguments(state), solved);
                 }
                 if ui.button("Copy command line").clicked() {
-                    ui.ctx().copy_text(app.session.command_line(&app.noted(), Path::new(&app.form.path)));
+                    ui.ctx().copy_text(state.session.command_line(&state.noted(), Path::new(&state.form.path)));
                 }
                 if ui.button("Copy configuration").clicked() {
-                    ui.ctx().copy_text(app.session.configuration(&app.noted()));
+                    ui.ctx().copy_text(state.session.configuration(&state.noted()));
                 }
             });
             if !known {
                 ui.label(RichText::new("Name the file with .exr, .tif or .hdr at its end").color(ui.visuals().warn_fg_color));
-            } else if !app.is_final() {
-                let text = if app.is_busy() {
+            } else if !state.is_final() {
+                let text = if state.is_busy() {
                     "The solution of this size and these settings is not there yet"
                 } else {
                     "Solve first (Ctrl+Enter)"
                 };
                 ui.label(RichText::new(text).color(ui.visuals().warn_fg_color));
             }
-            match &app.form.last {
+            match &state.form.last {
                 Some(Ok(text)) => drop(ui.label(text)),
                 Some(Err(text)) => drop(ui.label(RichText::new(text).color(ui.visuals().error_fg_color))),
-                None if app.form.busy => drop(ui.label("Writing ...")),
+                None if state.form.busy => drop(ui.label("Writing ...")),
                 None => {}
             }
         },
     );
-    app.form.open = open && app.form.open;
+    state.form.open = open && state.form.open;
 }

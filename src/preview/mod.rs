@@ -11,94 +11,23 @@ pub mod canvas;
 mod controls;
 mod device;
 mod export;
+mod main_view;
+mod messages;
+mod pictures;
+mod program;
 pub mod session;
 pub mod shortcuts;
+pub mod state;
 pub mod strip;
 pub mod words;
 pub mod worker;
 
-pub use app::App;
+pub use app::{App, Options};
+pub use program::{Opened, Program};
+pub use worker::Chosen;
 
-use crate::colour::Matrix;
-use crate::exposure::Bracket;
 use crate::gpu;
-use crate::pipeline::{Event, Outcome, Settings};
-use crate::response::Response;
-use std::any::Any;
-use std::ffi::OsString;
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
-
-/// Frames as the program read them.
-#[derive(Clone)]
-pub struct Opened {
-    /// The frames.
-    pub bracket: Arc<Bracket>,
-    /// Their response.
-    pub response: Response,
-    /// Their linear RGB to Rec. 709.
-    pub to_display: Matrix,
-    /// Whatever else the program needs to write results.
-    pub more: Arc<dyn Any + Send + Sync>,
-}
-
-/// `unshaken merge`, without its output on a terminal. Arguments are those of `merge`, without the word itself.
-pub trait Program: Send + Sync {
-    /// Reads the frames that the arguments name and finds their response.
-    ///
-    /// # Errors
-    /// What `merge` refuses, in its words.
-    fn open(&self, arguments: &[OsString], events: &mut dyn FnMut(Event) -> bool) -> anyhow::Result<Opened>;
-
-    /// The settings for frames of full size that the arguments ask for.
-    ///
-    /// # Errors
-    /// What `merge` refuses.
-    fn settings(&self, arguments: &[OsString], opened: &Opened) -> anyhow::Result<Settings>;
-
-    /// Writes the outputs that the arguments ask for, of the merge of `bracket`; returns what was written, in words.
-    ///
-    /// # Errors
-    /// As `merge`.
-    fn write(
-        &self,
-        arguments: &[OsString],
-        opened: &Opened,
-        bracket: &Bracket,
-        outcome: &Outcome,
-        warnings: &[String],
-    ) -> anyhow::Result<String>;
-}
-
-/// What was chosen in a dialog.
-#[derive(Clone, Debug)]
-pub enum Chosen {
-    /// Frames, or a session, to open.
-    Open(Vec<PathBuf>),
-    /// Frames to add to those that are open.
-    Add(Vec<PathBuf>),
-    /// Where to save the session.
-    Session(PathBuf),
-    /// Where to export to.
-    Export(PathBuf),
-}
-
-/// How the window starts.
-#[derive(Clone, Debug, Default)]
-pub struct Options {
-    /// Frames, or one session file.
-    pub files: Vec<PathBuf>,
-    /// Save a picture of the window here once the full-size solution is shown, and close it.
-    pub screenshot: Option<PathBuf>,
-    /// Window in points; `None`: the usual size.
-    pub size: Option<(f32, f32)>,
-    /// Begin with the blur.
-    pub blur: bool,
-    /// Light instead of what the system says.
-    pub light: Option<bool>,
-    /// Where recent files are remembered; `None`: nowhere.
-    pub recent: Option<PathBuf>,
-}
 
 /// Title of the window.
 const TITLE: &str = "unshaken";

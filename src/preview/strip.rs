@@ -1,40 +1,20 @@
 //! The strip of thumbnails, and the line of state below it.
 
-use super::app::{App, Source};
 use super::controls::bare;
+use super::state::{Source, State};
+use super::words::{seconds, time};
 use egui::{Color32, RichText, Vec2};
 
 /// Height of a thumbnail in points.
 const HEIGHT: f32 = 84.0;
 
-/// Seconds from what a user types: `1/30` or `0.2`.
-pub fn seconds(text: &str) -> Option<f64> {
-    let text = text.trim().trim_end_matches('s').trim();
-    let value = match text.split_once('/') {
-        Some((a, b)) => a.trim().parse::<f64>().ok()? / b.trim().parse::<f64>().ok()?,
-        None => text.parse().ok()?,
-    };
-    (value.is_finite() && value > 0.0).then_some(value)
-}
-
-/// An exposure time as photographers write it.
-pub fn time(seconds: f64) -> String {
-    let inverse = 1.0 / seconds;
-    if seconds < 0.3 && (inverse - inverse.round()).abs() < 0.02 * inverse {
-        format!("1/{} s", inverse.round())
-    } else {
-        let text = format!("{seconds:.3}");
-        format!("{} s", text.trim_end_matches('0').trim_end_matches('.'))
-    }
-}
-
 /// What is known of frame `i`: sharp or blurred, by how much.
-fn badge(app: &App, i: usize) -> Option<(String, Color32, String)> {
-    let shot = app.session.shots.get(i)?;
+fn badge(state: &State, i: usize) -> Option<(String, Color32, String)> {
+    let shot = state.session.shots.get(i)?;
     if shot.excluded {
         return Some(("left out".into(), Color32::from_gray(110), "left out by you".into()));
     }
-    let solved = app.solved.as_ref()?;
+    let solved = state.solved.as_ref()?;
     let frame = &solved.outcome.report["frames"][i];
     let reason = frame["triage"]["reason"].as_str().unwrap_or_default().to_string();
     if frame["used"] != true {
@@ -55,38 +35,38 @@ fn badge(app: &App, i: usize) -> Option<(String, Color32, String)> {
 }
 
 /// The strip: chosen by click, excluded, marked sharp, exposure time.
-pub fn strip(app: &mut App, ui: &mut egui::Ui) {
-    if app.session.shots.is_empty() {
+pub fn strip(state: &mut State, ui: &mut egui::Ui) {
+    if state.session.shots.is_empty() {
         return;
     }
     egui::Panel::bottom("frames").frame(bare(ui)).resizable(false).show(ui, |ui| {
         egui::ScrollArea::horizontal().auto_shrink([false, true]).show(ui, |ui| {
             ui.horizontal(|ui| {
-                for i in 0..app.session.shots.len() {
-                    one(app, ui, i);
+                for i in 0..state.session.shots.len() {
+                    one(state, ui, i);
                 }
             });
         });
     });
 }
 
-fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
-    let name = app.session.shots[i].name();
-    let path = app.session.shots[i].path.clone();
-    let chosen = app.frame == i;
+fn one(state: &mut State, ui: &mut egui::Ui, i: usize) {
+    let name = state.session.shots[i].name();
+    let path = state.session.shots[i].path.clone();
+    let chosen = state.frame == i;
     let stroke =
         if chosen { ui.visuals().selection.stroke } else { egui::Stroke::new(1.0, ui.visuals().weak_text_color().gamma_multiply(0.4)) };
-    let badge = badge(app, i);
+    let badge = badge(state, i);
     egui::Frame::new().stroke(stroke).inner_margin(5).corner_radius(4).show(ui, |ui| {
         ui.vertical(|ui| {
-            let (texture, size) = match app.thumbs.get(&path) {
+            let (texture, size) = match state.thumbs.get(&path) {
                 Some(Ok(t)) => (Some((t.texture.id(), t.texture.size_vec2())), t.size),
                 _ => (None, (3, 2)),
             };
             let width = HEIGHT * size.0 as f32 / size.1.max(1) as f32;
             let (rect, response) = ui.allocate_exact_size(Vec2::new(width.clamp(60.0, 220.0), HEIGHT), egui::Sense::click());
             response.widget_info(|| egui::WidgetInfo::selected(egui::Role::Button, true, chosen, format!("Choose frame {}", i + 1)));
-            let tint = if app.session.shots[i].excluded { Color32::from_gray(90) } else { Color32::WHITE };
+            let tint = if state.session.shots[i].excluded { Color32::from_gray(90) } else { Color32::WHITE };
             match texture {
                 Some((id, _)) => {
                     let whole = egui::Rect::from_min_max(egui::Pos2::ZERO, egui::Pos2::new(1.0, 1.0));
@@ -94,7 +74,7 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
                 }
                 None => {
                     ui.painter().rect_filled(rect, 2.0, ui.visuals().extreme_bg_color);
-                    let text = if matches!(app.thumbs.get(&path), Some(Err(_))) { "cannot be read" } else { "..." };
+                    let text = if matches!(state.thumbs.get(&path), Some(Err(_))) { "cannot be read" } else { "..." };
                     ui.painter().text(
                         rect.center(),
                         egui::Align2::CENTER_CENTER,
@@ -105,10 +85,10 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
                 }
             }
             if response.clicked() {
-                app.choose(i);
+                state.choose(i);
             }
             if response.double_clicked() {
-                app.before = Source::Frame(i);
+                state.before = Source::Frame(i);
             }
             response.on_hover_text(format!("{name}\nDouble click: show it left of the divider"));
             if let Some((text, colour, why)) = &badge {
@@ -124,10 +104,10 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
             ui.horizontal(|ui| {
                 ui.spacing_mut().item_spacing.x = 4.0;
                 ui.label(RichText::new(format!("{}", i + 1)).strong());
-                let noted = app.thumbs.get(&path).and_then(|t| t.as_ref().ok()).and_then(|t| t.exposure_time);
-                let given = app.session.shots[i].exposure_time;
+                let noted = state.thumbs.get(&path).and_then(|t| t.as_ref().ok()).and_then(|t| t.exposure_time);
+                let given = state.session.shots[i].exposure_time;
                 let shown = given.or(noted).map(time).unwrap_or_default();
-                let mut text = app.typed.get(&path).cloned().unwrap_or_else(|| shown.clone());
+                let mut text = state.typed.get(&path).cloned().unwrap_or_else(|| shown.clone());
                 let missing = given.or(noted).is_none();
                 let mut edit = egui::TextEdit::singleline(&mut text).desired_width(54.0).hint_text("time?");
                 if missing {
@@ -140,15 +120,15 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
                     info
                 });
                 if response.changed() {
-                    app.typed.insert(path.clone(), text.clone());
+                    state.typed.insert(path.clone(), text.clone());
                 }
-                if response.lost_focus() && app.typed.remove(&path).is_some() {
+                if response.lost_focus() && state.typed.remove(&path).is_some() {
                     match (text.trim().is_empty(), seconds(&text)) {
-                        (true, _) => app.session.shots[i].exposure_time = None,
-                        (_, Some(t)) if Some(t) != given.or(noted) && time(t) != shown => app.session.shots[i].exposure_time = Some(t),
+                        (true, _) => state.session.shots[i].exposure_time = None,
+                        (_, Some(t)) if Some(t) != given.or(noted) && time(t) != shown => state.session.shots[i].exposure_time = Some(t),
                         (_, Some(_)) => {}
                         (_, None) => {
-                            app.say(format!("{text:?} is no exposure time; type seconds such as 1/30 or 0.2"), true, None);
+                            state.say(format!("{text:?} is no exposure time; type seconds such as 1/30 or 0.2"), true, None);
                         }
                     }
                 }
@@ -157,7 +137,7 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
                 } else {
                     "Exposure time in seconds"
                 });
-                let shot = &mut app.session.shots[i];
+                let shot = &mut state.session.shots[i];
                 let mut used = !shot.excluded;
                 let label = format!("Use frame {}", i + 1);
                 let response = ui.checkbox(&mut used, "use");
@@ -174,11 +154,11 @@ fn one(app: &mut App, ui: &mut egui::Ui, i: usize) {
 }
 
 /// What goes on, and what is under the pointer.
-pub fn status(app: &mut App, ui: &mut egui::Ui) {
+pub fn status(state: &mut State, ui: &mut egui::Ui) {
     let mut cancel = false;
     egui::Panel::bottom("status").frame(bare(ui)).resizable(false).show(ui, |ui| {
         ui.horizontal(|ui| {
-            if let Some(running) = &app.running {
+            if let Some(running) = &state.running {
                 let elapsed = running.began.elapsed().as_secs_f32();
                 let left = (running.fraction > 0.05).then(|| elapsed * (1.0 - running.fraction) / running.fraction);
                 let size = if running.divisor > 1 { format!(" at 1/{}", running.divisor) } else { String::new() };
@@ -188,25 +168,25 @@ pub fn status(app: &mut App, ui: &mut egui::Ui) {
                 let text = format!("{}{size}{left}", running.stage);
                 ui.add(egui::ProgressBar::new(running.fraction).desired_width(160.0).show_percentage());
                 ui.label(text);
-            } else if let Some(solved) = &app.solved {
-                let state = if app.is_final() { "Solved" } else { "Stopped; solve again with Ctrl+Enter" };
+            } else if let Some(solved) = &state.solved {
+                let how = if state.is_final() { "Solved" } else { "Stopped; solve again with Ctrl+Enter" };
                 let (w, h) = solved.bracket.size();
-                ui.label(format!("{state}: {w} x {h} in {:.1} s", solved.seconds));
-            } else if let Some(lacking) = app.lacking().filter(|_| !app.session.shots.is_empty()) {
+                ui.label(format!("{how}: {w} x {h} in {:.1} s", solved.seconds));
+            } else if let Some(lacking) = state.lacking().filter(|_| !state.session.shots.is_empty()) {
                 ui.label(RichText::new(lacking).color(ui.visuals().warn_fg_color));
             } else {
                 ui.label("Ready");
             }
             ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
-                if let Some((x, y)) = app.probe {
+                if let Some((x, y)) = state.probe {
                     ui.monospace(format!("{x}, {y}"));
                 }
                 let percent = |z: f32| format!("{:.0} %", 100.0 * z * ui.ctx().pixels_per_point());
-                ui.label(app.view.zoom.map_or("fit".to_string(), percent));
+                ui.label(state.view.zoom.map_or("fit".to_string(), percent));
             });
         });
     });
     if cancel {
-        app.cancel();
+        state.cancel();
     }
 }

@@ -1,4 +1,4 @@
-//! What the engine says in the words of the command line, in those of the window.
+//! Words of the window: what the engine says in those of the command line, and exposure times as they are typed and read.
 
 /// Options of `merge`, and what sets them in the window.
 pub const CONTROLS: [(&str, &str); 17] = [
@@ -33,4 +33,25 @@ pub fn in_window(text: &str) -> String {
         rest = &rest[end..];
     }
     out + rest
+}
+
+/// Seconds from what a user types: `1/30` or `0.2`.
+pub fn seconds(text: &str) -> Option<f64> {
+    let text = text.trim().trim_end_matches('s').trim();
+    let value = match text.split_once('/') {
+        Some((a, b)) => a.trim().parse::<f64>().ok()? / b.trim().parse::<f64>().ok()?,
+        None => text.parse().ok()?,
+    };
+    (value.is_finite() && value > 0.0).then_some(value)
+}
+
+/// An exposure time as photographers write it.
+pub fn time(seconds: f64) -> String {
+    let inverse = 1.0 / seconds;
+    if seconds < 0.3 && (inverse - inverse.round()).abs() < 0.02 * inverse {
+        format!("1/{} s", inverse.round())
+    } else {
+        let text = format!("{seconds:.3}");
+        format!("{} s", text.trim_end_matches('0').trim_end_matches('.'))
+    }
 }

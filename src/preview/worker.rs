@@ -1,7 +1,7 @@
 //! What takes time, on three threads beside the window's: one solves, one tones, one does everything else. All tell [`News`].
 
+use super::program::{Opened, Program};
 use super::session::Session;
-use super::{Opened, Program};
 use crate::baseline;
 use crate::colour::{self, Matrix};
 use crate::error::Error;
@@ -171,6 +171,19 @@ impl Failure {
     }
 }
 
+/// What was chosen in a dialog.
+#[derive(Clone, Debug)]
+pub enum Chosen {
+    /// Frames, or a session, to open.
+    Open(Vec<PathBuf>),
+    /// Frames to add to those that are open.
+    Add(Vec<PathBuf>),
+    /// Where to save the session.
+    Session(PathBuf),
+    /// Where to export to.
+    Export(PathBuf),
+}
+
 /// What the window hears.
 pub enum News {
     /// A file was looked at.
@@ -205,7 +218,7 @@ pub enum News {
     /// Something was written, or why not.
     Written(Result<String, String>),
     /// Files were chosen in a dialog.
-    Chosen(super::Chosen),
+    Chosen(Chosen),
 }
 
 /// What an overlay shows, and of which frame.

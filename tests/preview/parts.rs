@@ -4,8 +4,7 @@ use unshaken::image::{Plane, Rgb};
 use unshaken::pose::Pose;
 use unshaken::preview::blur::{nice, psf_at, tree};
 use unshaken::preview::shortcuts::KEYS;
-use unshaken::preview::strip::{seconds, time};
-use unshaken::preview::words::{CONTROLS, in_window};
+use unshaken::preview::words::{CONTROLS, in_window, seconds, time};
 use unshaken::preview::worker::{BINS_PER_STOP, Histogram, divisors};
 use unshaken::tsf::Tsf;
 

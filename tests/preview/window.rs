@@ -6,8 +6,8 @@ use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use unshaken::preview::Options;
-use unshaken::preview::app::Over;
 use unshaken::preview::session::Session;
+use unshaken::preview::state::Over;
 use unshaken::tonemap::Operator;
 
 fn bracket() -> (tempfile::TempDir, Vec<std::path::PathBuf>) {

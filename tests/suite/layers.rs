@@ -3,8 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+/// Names, each with the names that it may use.
+type Table = &'static [(&'static str, &'static [&'static str])];
+
 /// Module: what it may name of the crate, as `module` or, where only some items may pass, `module::Item`.
-const TABLE: &[(&str, &[&str])] = &[
+const TABLE: Table = &[
     // What everything else speaks of.
     ("error", &[]),
     ("image", &["error"]),
@@ -157,6 +160,69 @@ const TABLE: &[(&str, &[&str])] = &[
     ("main", &["cli"]),
 ];
 
+/// The files of some modules' folders, from the bottom up, each with what it may name of its folder: files, which must stand before it, so that
+/// no two need each other, and items of the module's head.
+const WITHIN: &[(&str, Table)] = &[
+    (
+        "kernels",
+        &[
+            // What an operator is given.
+            ("scratch", &[]),
+            ("geometry", &[]),
+            ("tables", &[]),
+            // The designs of K: neither knows the other, nor who chooses.
+            ("bands", &["scratch", "geometry", "tables"]),
+            ("tiles", &["scratch", "geometry", "tables"]),
+            ("blur", &["scratch", "geometry", "tables", "bands", "tiles"]),
+            // The other operators, and the window's kernels.
+            ("linear", &["DeviceRgb"]),
+            ("data", &["linear"]),
+            ("display", &["DeviceRgb"]),
+        ],
+    ),
+    (
+        "preview",
+        &[
+            ("words", &[]),
+            ("shortcuts", &[]),
+            ("device", &[]),
+            ("program", &[]),
+            ("session", &[]),
+            // What takes time, and what comes of it.
+            ("worker", &["program", "session"]),
+            ("canvas", &["worker"]),
+            ("pictures", &["worker"]),
+            // What every part of the window shows and changes; the parts do not know the window.
+            ("state", &["words", "program", "session", "worker", "canvas", "pictures"]),
+            ("messages", &["state"]),
+            ("export", &["worker", "state"]),
+            ("blur", &["worker", "canvas", "state"]),
+            ("main_view", &["worker", "canvas", "state", "blur"]),
+            ("controls", &["words", "shortcuts", "session", "worker", "state", "export", "blur"]),
+            ("strip", &["words", "state", "controls"]),
+            (
+                "app",
+                &[
+                    "words",
+                    "shortcuts",
+                    "device",
+                    "program",
+                    "session",
+                    "worker",
+                    "canvas",
+                    "state",
+                    "messages",
+                    "export",
+                    "blur",
+                    "main_view",
+                    "controls",
+                    "strip",
+                ],
+            ),
+        ],
+    ),
+];
+
 /// The code of a source: no comments, no strings' contents that matter, one line.
 fn code(source: &str) -> String {
     let lines = source.lines().map(|l| l.split("//").next().unwrap_or_default());
@@ -226,7 +292,7 @@ fn closing(text: &str) -> usize {
 }
 
 /// What `sources` (module, text) import against `table`, one line each.
-fn violations(sources: &[(String, String)], table: &[(&str, &[&str])]) -> Vec<String> {
+fn violations(sources: &[(String, String)], table: Table) -> Vec<String> {
     let table: BTreeMap<_, _> = table.iter().copied().collect();
     let mut found = Vec::new();
     for (module, text) in sources {
@@ -239,6 +305,29 @@ fn violations(sources: &[(String, String)], table: &[(&str, &[&str])]) -> Vec<St
             let other = path.split("::").next().unwrap_or_default();
             if other != module && !allowed.contains(&other) && !allowed.contains(&path.as_str()) {
                 found.push(format!("{module} may not import {path}"));
+            }
+        }
+    }
+    found
+}
+
+/// What the files of the module `folder` (name, text) import of each other against `files`, one line each, and what is wrong with `files`.
+fn violations_within(folder: &str, sources: &[(String, String)], files: Table) -> Vec<String> {
+    let mut found = Vec::new();
+    for (i, (file, allowed)) in files.iter().enumerate() {
+        if let Some(late) = files[i..].iter().find(|(f, _)| allowed.contains(f)) {
+            found.push(format!("{folder}/{file} is allowed {}, which does not come before it", late.0));
+        }
+    }
+    for (file, text) in sources {
+        let Some((_, allowed)) = files.iter().find(|(f, _)| f == file) else {
+            found.push(format!("{folder}/{file} has no line in the table of files"));
+            continue;
+        };
+        for path in paths(text, "super::").union(&paths(text, &format!("crate::{folder}::"))) {
+            let other = path.split("::").next().unwrap_or_default();
+            if !allowed.contains(&other) {
+                found.push(format!("{folder}/{file} may not import {path}"));
             }
         }
     }
@@ -266,6 +355,46 @@ fn modules_import_what_their_layer_allows() {
     assert!(all.len() > 15, "only {} sources found", all.len());
     let found = violations(&all, TABLE);
     assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn files_of_a_module_import_what_their_layer_allows() {
+    for (folder, files) in WITHIN {
+        let mut found = Vec::new();
+        for entry in std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("src").join(folder)).expect("the sources") {
+            let path = entry.expect("readable").path();
+            let name = path.file_stem().expect("a name").to_str().expect("ASCII").to_string();
+            // The head of the module knows all its files, and hands on what of them is known outside.
+            if name != "mod" {
+                found.push((name, std::fs::read_to_string(&path).expect("text")));
+            }
+        }
+        assert_eq!(found.len(), files.len(), "{folder}");
+        let found = violations_within(folder, &found, files);
+        assert!(found.is_empty(), "{}", found.join("\n"));
+    }
+}
+
+#[test]
+fn a_wrong_import_within_a_module_is_found() {
+    let files: Table = &[("below", &[]), ("above", &["below", "Name"])];
+    let check = |file: &str, text: &str| violations_within("kernels", &[(file.into(), text.into())], files);
+    for (file, text) in [
+        ("below", "use super::above::Thing;"),
+        ("below", "use super::{above, Name};"),
+        ("below", "fn f() -> crate::kernels::above::Thing {}"),
+        ("above", "use super::*;"),
+        ("beside", ""),
+    ] {
+        assert!(!check(file, text).is_empty(), "{file}: {text}");
+    }
+    for (file, text) in
+        [("above", "use super::{Name, below::{Thing, Other}};"), ("below", "// super::above\npub(super) fn f() {}\nuse crate::gpu::Gpu;")]
+    {
+        assert_eq!(check(file, text), Vec::<String>::new(), "{file}: {text}");
+    }
+    let circle: Table = &[("one", &["other"]), ("other", &["one"])];
+    assert_eq!(violations_within("kernels", &[], circle).len(), 1);
 }
 
 #[test]
