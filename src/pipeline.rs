@@ -386,7 +386,8 @@ impl Run<'_> {
         Ok(verdicts)
     }
 
-    /// Which of the frames `used` are sharp where they lie, those that could not be registered left out; `None` where none moved: it is known.
+    /// Which of the frames `used` are sharp where they lie, those that could not be registered left out; `None` where none moved and their noise is what it seemed: it
+    /// is known.
     fn triaged_in_place(&self, found: &[Registration], used: &[usize], excluded: &[bool]) -> Option<Vec<Verdict>> {
         let mut excluded = excluded.to_vec();
         for &i in used {
@@ -394,8 +395,24 @@ impl Run<'_> {
         }
         let motions: Vec<DMat3> = found.iter().map(Registration::motion).collect();
         let moved = motions.iter().any(|m| *m != DMat3::IDENTITY) || used.iter().any(|&i| excluded[i]);
+        let placed: Vec<usize> = used.iter().copied().filter(|&i| !excluded[i]).collect();
+        let noise = self.smoothed_noise(&placed, &motions);
+        if !moved && noise.is_none() {
+            return None;
+        }
+        let frames = self.bracket.frames();
+        let curves = noise.map(|noise| noise::curves(frames, self.response, &noise));
         let given = self.settings.sharp.as_deref();
-        moved.then(|| triage::triage(self.bracket.frames(), &self.exposures, &self.curves, &excluded, given, &motions))
+        Some(triage::triage(frames, &self.exposures, curves.as_ref().unwrap_or(&self.curves), &excluded, given, &motions))
+    }
+
+    /// The noise level of the frames `ids`, placed by `motions`, if a file format has made it smoother than it is; whether they are sharp is not known.
+    fn smoothed_noise(&self, ids: &[usize], motions: &[DMat3]) -> Option<NoiseModel> {
+        let frames = self.bracket.frames();
+        if self.settings.noise.is_some() || !ids.iter().any(|&i| frames[i].lossy) {
+            return None;
+        }
+        noise::of_squares(frames, &self.exposures, self.response, ids, motions, false, &self.noise)
     }
 
     /// Where the frames `used` lie, by the longest of those that are `sharp` or, if most do not fit that, by the next.
@@ -453,7 +470,7 @@ impl Run<'_> {
                 // Of files that keep their noise the first estimate is right, and what a registration that is not quite true leaves would pass for more.
                 let tells = |&i: &usize| frames[i].lossy || run.motions[i] == run.motions[still[0]];
                 let told: Vec<usize> = still.iter().copied().filter(tells).collect();
-                Ok(noise::of_squares(frames, &run.exposures, run.response, &told, &run.motions, &run.noise))
+                Ok(noise::of_squares(frames, &run.exposures, run.response, &told, &run.motions, true, &run.noise))
             },
         )?;
         if let Some(noise) = noise {
@@ -495,7 +512,7 @@ impl Run<'_> {
             }
         }
         let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
-        let verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
+        let mut verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
             self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
             let (verdicts, found, motions, registrations, left_out, degraded) = self.remembered(
                 "registration",
@@ -535,6 +552,10 @@ impl Run<'_> {
         let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
         let doubt = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
         if may_doubt {
+            for i in blind::untold(&verdicts, &sharp, &used, |ids| self.bracket.shortest(ids)) {
+                sharp[i] = false;
+                verdicts[i].reason = "nothing that another frame sees clearly as well tells whether it is sharp".into();
+            }
             let (unsure, sure) = blind::unsure_beside(&verdicts, &sharp, &used);
             if !unsure.is_empty() {
                 self.progress("looking whether frames that seem sharp moved", 0.02)?;

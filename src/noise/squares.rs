@@ -32,8 +32,8 @@ const MOST_SMOOTHED: f64 = 50.0;
 
 /// The noise level of the frames `ids`, which show the same where each lies by `motions` (from one grid to that of every frame, centred pixels), if they have
 /// clearly more noise than `model` says: from the differences between each and the next longer one, averaged over squares, from one square to the next. Of displaced
-/// frames the flattest squares, of which a registration that is not quite true changes the least, tell by how much there is more; they are too few to tell shot noise from read
-/// noise.
+/// frames, and where they are not known to be `sharp`, the flattest squares, of which a registration that is not quite true and blur change the least, tell by how much there is
+/// more; they are too few to tell shot noise from read noise.
 /// `None` where `model` does well or too little is unclipped.
 pub fn of_squares(
     frames: &[Frame],
@@ -41,12 +41,13 @@ pub fn of_squares(
     response: &Response,
     ids: &[usize],
     motions: &[DMat3],
+    sharp: bool,
     model: &NoiseModel,
 ) -> Option<NoiseModel> {
     let of_pair = |(i, j): (usize, usize)| {
-        let in_place = motions[i] == motions[j];
-        let motion = if in_place { DMat3::IDENTITY } else { motions[j] * motions[i].inverse() };
-        let mut found = differences(frames, exposures, response, i, j, &motion);
+        let in_place = sharp && motions[i] == motions[j];
+        let motion = if motions[i] == motions[j] { DMat3::IDENTITY } else { motions[j] * motions[i].inverse() };
+        let mut found = differences(frames, exposures, response, (i, j), &motion, sharp);
         if !in_place {
             found = flattest(found);
         }
@@ -54,8 +55,8 @@ pub fn of_squares(
         all.into_iter().filter(move |s| in_place || s.exposure < FLAT)
     };
     let mut samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
-    let displaced = ids.iter().any(|&i| motions[i] != motions[ids[0]]);
-    if !displaced && samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
+    let in_place = sharp && ids.iter().all(|&i| motions[i] == motions[ids[0]]);
+    if in_place && samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
         samples.retain(|s| s.exposure < DARK);
     }
     let (mut excess, mut count) = (0.0, 0.0);
@@ -66,7 +67,7 @@ pub fn of_squares(
     if samples.is_empty() || excess <= SMOOTHED.ln() * count {
         return None;
     }
-    if !displaced {
+    if in_place {
         return fit(&samples, HALF);
     }
     let more = (excess / count).exp().min(MOST_SMOOTHED);
@@ -76,13 +77,21 @@ pub fn of_squares(
 /// What two neighbouring squares say of the noise.
 struct Difference {
     sample: Sample,
-    /// Mean square over squared mean of the longer frame's exposure, in the square where that is larger.
+    /// Mean square over squared mean of the longer frame's exposure, in the square where that is larger; of either frame's where they are not known to be sharp, since blur
+    /// makes squares flat.
     contrast: f64,
 }
 
 /// Squared differences of neighbouring squares of frame `i` less frame `j`, which is the longer one and lies at `motion` from it, all channels, as variances of
 /// single pixels. Interpolation between the longer one's pixels takes up to an eighth of its part, which is the lesser, and is not made up for.
-fn differences(frames: &[Frame], exposures: &[Rgb], response: &Response, i: usize, j: usize, motion: &DMat3) -> Vec<Difference> {
+fn differences(
+    frames: &[Frame],
+    exposures: &[Rgb],
+    response: &Response,
+    (i, j): (usize, usize),
+    motion: &DMat3,
+    sharp: bool,
+) -> Vec<Difference> {
     let ratio = frames[i].exposure_time / frames[j].exposure_time;
     let levels = frames[i].levels.min(frames[j].levels);
     let of_channel = |c: usize| {
@@ -94,7 +103,8 @@ fn differences(frames: &[Frame], exposures: &[Rgb], response: &Response, i: usiz
             let square = 0.5 * (a.less - b.less).powi(2) * (SQUARE * SQUARE) as f64;
             // The quantile is divided by its part of the expectation later on.
             let variance = (square - MIDDLE.of_noise * rounding(&quantum, exposure, ratio)).max(0.0);
-            Difference { sample: Sample::new(exposure, ratio, variance), contrast: a.contrast.max(b.contrast) }
+            let contrast = |s: &Square| if sharp { s.contrast } else { s.contrast.max(s.own_contrast) };
+            Difference { sample: Sample::new(exposure, ratio, variance), contrast: contrast(a).max(contrast(b)) }
         };
         let pair = |k: usize, next: usize| Some(difference((means[k].as_ref()?, means.get(next)?.as_ref()?)));
         let across = (0..means.len()).filter(|k| (k + 1) % columns != 0).filter_map(|k| pair(k, k + 1));
@@ -125,6 +135,8 @@ struct Square {
     less: f64,
     /// Mean square of the longer frame's exposure over its squared mean.
     contrast: f64,
+    /// The same of the shorter frame.
+    own_contrast: f64,
 }
 
 /// Each whole square of the shorter frame beside the longer one, which lies at `motion` from it, where both are unclipped throughout.
@@ -147,18 +159,25 @@ fn means(intensities: [&Plane; 2], exposures: [&Plane; 2], ratio: f64, motion: &
     };
     let mean = |k: usize| {
         let (x, y) = (k % columns * SQUARE, k / columns * SQUARE);
-        let (mut own, mut longer_one, mut squares) = (0.0, 0.0, 0.0);
+        let (mut own, mut own_squares, mut longer_one, mut squares) = (0.0, 0.0, 0.0, 0.0);
         for (i, j) in (y..y + SQUARE).flat_map(|j| (x..x + SQUARE).map(move |i| (i, j))) {
             if !clear(intensities[0], i, j) {
                 return None;
             }
-            let value = longer(i, j)?;
-            own += f64::from(exposures[0].at(i, j));
+            let (shorter, value) = (f64::from(exposures[0].at(i, j)), longer(i, j)?);
+            own += shorter;
+            own_squares += shorter * shorter;
             longer_one += value;
             squares += value * value;
         }
         let n = (SQUARE * SQUARE) as f64;
-        Some(Square { own: own / n, less: (own - ratio * longer_one) / n, contrast: n * squares / (longer_one * longer_one) })
+        let contrast = |sum: f64, squares: f64| n * squares / (sum * sum);
+        Some(Square {
+            own: own / n,
+            less: (own - ratio * longer_one) / n,
+            contrast: contrast(longer_one, squares),
+            own_contrast: contrast(own, own_squares),
+        })
     };
     (0..columns * rows).map(mean).collect()
 }

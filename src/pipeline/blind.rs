@@ -176,8 +176,6 @@ const SURELY_STEEP: f64 = 0.60;
 /// Detail up to which a frame that passes for sharp may be blurred, though another frame is surely sharp: most sharp ones measure more. At night, where
 /// little but lamps can be seen, blurred ones may do so too.
 const SURELY_DETAILED: f64 = 0.85;
-/// Steepness below which a frame that passes for sharp may be blurred, if nothing says how fine its structure is and another frame has a surely steep edge.
-const SOFT: f64 = 0.45;
 /// How alike three frames or more are in their fine structure that stood still: sharp ones measure 0.92 and more in place and 0.77 and more displaced, two
 /// shaken ones that are in doubt up to 0.76.
 const ALIKE: f64 = 0.78;
@@ -208,7 +206,6 @@ const CLEAR: f64 = 5.0;
 const SURELY_SHAKEN: f64 = 3.0;
 /// Extent beside the frames that stand still, as they are, from which that is confirmed: between the two, since their noise widens it.
 const CONFIRMED: f64 = 2.25;
-
 /// Detail below which a frame that passes for sharp may have moved by a pixel or two, though an edge of it or of another is surely steep: sharp ones in
 /// place mostly measure 1. Being asked costs a sharp frame time alone.
 const LESS_DETAILED: f64 = 0.9;
@@ -283,9 +280,19 @@ fn chained(verdicts: &[Verdict], frames: &[usize]) -> f64 {
 /// of the next, and the trail of a lamp has steep edges of its own.
 pub(super) fn unsure_beside(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> (Vec<usize>, Vec<usize>) {
     let passing = used.iter().copied().filter(|&i| sharp[i]);
-    let little = |v: &Verdict| if v.compared { v.detail < SURELY_DETAILED } else { v.steepness < SOFT };
-    let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(|&i| little(&verdicts[i]));
+    let little = |i: &usize| verdicts[*i].compared && verdicts[*i].detail < SURELY_DETAILED;
+    let (unsure, sure): (Vec<usize>, Vec<usize>) = passing.partition(little);
     if sure.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) { (unsure, sure) } else { (Vec::new(), Vec::new()) }
+}
+
+/// Frames that pass for sharp though none of them can be compared with another, an edge of one being steep, which may be a lamp's trail: all but the one with the
+/// `shortest` exposure time, which is the least likely to have moved. Without a steep edge that is a doubt about all of them.
+pub(super) fn untold(verdicts: &[Verdict], sharp: &[bool], used: &[usize], shortest: impl Fn(&[usize]) -> Option<usize>) -> Vec<usize> {
+    let passing: Vec<usize> = used.iter().copied().filter(|&i| sharp[i]).collect();
+    if passing.iter().any(|&i| verdicts[i].compared) || !passing.iter().any(|&i| verdicts[i].steepness >= SURELY_STEEP) {
+        return Vec::new();
+    }
+    without(&passing, &shortest(&passing).into_iter().collect::<Vec<_>>())
 }
 
 /// Whether one of the frames `used` that passes for sharp has a little less fine structure than another: those that do not may have moved a little as well.
@@ -848,8 +855,23 @@ mod tests {
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "trails of lamps have steep edges, too");
         all[1] = Verdict { compared: false, ..verdict(0.71, 0.5, true) };
         assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![], vec![0, 1, 2]), "nothing says that it is less fine than another");
-        all[1] = Verdict { compared: false, ..verdict(1.0, 0.34, true) };
-        assert_eq!(of(&all, &[0, 1, 2, 3]), (vec![1], vec![0, 2]), "its edges are far softer than another's");
+    }
+
+    #[test]
+    fn of_frames_that_nothing_can_be_compared_with_the_shortest_counts_as_sharp() {
+        let shortest = |ids: &[usize]| ids.iter().copied().min_by_key(|i| [2, 1, 3][*i]);
+        let of = |steep: [f64; 3], used: &[usize]| {
+            let all = steep.map(|s| Verdict { compared: false, ..verdict(1.0, s, true) });
+            untold(&all, &[true, true, true], used, shortest)
+        };
+        assert_eq!(of([0.7, 0.7, 0.7], &[0, 1, 2]), [0, 2]);
+        assert_eq!(of([0.7, 0.5, 0.5], &[0, 1, 2]), [0, 2], "trails have steep edges, and noise hides others");
+        assert_eq!(of([0.7, 0.5, 0.5], &[0, 2]), [2], "of those in use");
+        assert_eq!(of([0.5, 0.5, 0.5], &[0, 1, 2]), [0; 0], "no edge is steep: that is a doubt about all");
+        let mut all = [0.7, 0.7, 0.7].map(|s| Verdict { compared: false, ..verdict(1.0, s, true) });
+        all[2].compared = true;
+        assert_eq!(untold(&all, &[true, true, true], &[0, 1, 2], shortest), [0; 0], "something tells");
+        assert_eq!(untold(&all, &[true, true, false], &[0, 1, 2], shortest), [0], "of those that pass");
     }
 
     #[test]

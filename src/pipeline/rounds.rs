@@ -27,13 +27,17 @@ struct Lay {
     worse: f64,
     /// The same where its fine structure cannot be told.
     uncompared: f64,
+    /// Extent of its blur in pixels below which that is none, however much worse the same place without it is.
+    extent: f64,
 }
 
-/// Whatever its blur explains. Sharp frames measure -0.04 to 0.007, one of 1.5 px 0.24.
-const AS_WELL: Lay = Lay { detail: 0.5, worse: 0.05, uncompared: 0.05 };
+/// Whatever its blur explains. Sharp frames measure -0.04 to 0.007, one of 1.5 px 0.24; where their fine structure cannot be told sharp ones up to 0.19 and blurs of 6 px and
+/// more from 0.43 on. A sharp frame was found with an extent of 0 px, half a pixel from where registration had it
+/// (0.19); frames of 1.5 px have 1.45 and more.
+const AS_WELL: Lay = Lay { detail: 0.5, worse: 0.05, uncompared: 0.28, extent: 1.0 };
 /// Where its blur does not explain it. Displaced sharp frames that are softer than the reference measure 0.70 and 0.42, blurs of 4 px and more less than 0.5 and
 /// 1.3 and more.
-const NEARLY: Lay = Lay { detail: 0.6, worse: 0.8, uncompared: 0.1 };
+const NEARLY: Lay = Lay { detail: 0.6, worse: 0.8, uncompared: 0.1, extent: 0.0 };
 
 impl Lay {
     /// Whether a frame of which `verdict` and `detail` tell lay still.
@@ -45,7 +49,8 @@ impl Lay {
         } else {
             return false;
         };
-        detail["still_worse_by"].as_f64().is_some_and(|worse| worse < most)
+        let below = |what: &str, most: f64| detail[what].as_f64().is_some_and(|v| v < most);
+        below("still_worse_by", most) || below("extent_px", self.extent)
     }
 }
 
@@ -125,7 +130,8 @@ impl Run<'_> {
         let reference = self.laid_out(&sorted)?;
         let (mut bracket, sharp_alone) = self.sharp_frames(sorted, reference)?;
         self.estimate_blurs(&mut bracket)?;
-        let lay = |i: &usize| self.lay_still(&AS_WELL, &bracket.still, &bracket.verdicts[*i], &bracket.details[*i]);
+        let untold = |i: &usize| bracket.shaken.contains(i) && bracket.tsfs[*i].is_none();
+        let lay = |i: &usize| untold(i) || self.lay_still(&AS_WELL, &bracket.still, &bracket.verdicts[*i], &bracket.details[*i]);
         let lay: Vec<usize> = bracket.estimated.iter().copied().filter(lay).collect();
         if !lay.is_empty() {
             return self.counted_as_sharp(bracket, &lay, noise, may_have_moved);
@@ -173,7 +179,12 @@ impl Run<'_> {
     /// Whether a frame of which `verdict` and `detail` tell lay still, by `line`, beside the sharp frames `still`: one that registration has found, as no blur explains more
     /// than none of another scene either. Nobody asks where it was said which frames are sharp.
     fn lay_still(&self, line: &Lay, still: &[usize], verdict: &Verdict, detail: &Value) -> bool {
-        self.settings.align && self.settings.sharp.is_none() && !still.is_empty() && line.holds(verdict, detail)
+        self.may_lie(still) && line.holds(verdict, detail)
+    }
+
+    /// Whether a frame that passed for shaken may count as it lies beside the sharp frames `still`.
+    fn may_lie(&self, still: &[usize]) -> bool {
+        self.settings.align && self.settings.sharp.is_none() && !still.is_empty()
     }
 
     /// The irradiance of a bracket of which the frames `ids` are sharp after all. Such a frame is placed by all of its pixels, a shaken one by the middle of its blur.
@@ -284,7 +295,8 @@ impl Run<'_> {
         Ok((known, SharpAlone { frames, placed, initial, pad, settings, converged }))
     }
 
-    /// TSFs of the shaken frames of which none is known, against the sharp ones; a frame of which none is found is left out.
+    /// TSFs of the shaken frames of which none is known, against the sharp ones. A frame of which none is found is left out, unless nothing told whether it is sharp either: then it
+    /// has little in common with the others, and what it alone shows, such as the light of a window that they burn out, would be lost.
     fn estimate_blurs(&mut self, bracket: &mut Known) -> Result<()> {
         for (k, &i) in bracket.estimated.iter().enumerate() {
             let part = k as f32 / bracket.estimated.len() as f32;
@@ -292,17 +304,18 @@ impl Run<'_> {
             let own = format!("{i} {:?} {:?}", self.settings.model, self.settings.focal_px);
             let look = |run: &mut Self| Ok(run.estimate(i, &bracket.latent, |frame, search| frame.estimate(search)));
             let (tsf, detail) = self.remembered("blur", &own, |_| 0, look)?;
-            if tsf.is_none() {
+            let untold = !bracket.verdicts[i].compared && self.may_lie(&bracket.still);
+            if tsf.is_none() && !untold {
                 self.leave_out(
                     i,
                     "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
                      time, or more detail where this frame is not clipped, would help)",
                 )?;
+                bracket.shaken.retain(|&k| k != i);
             }
             (bracket.tsfs[i], bracket.details[i]) = (tsf, detail);
         }
         self.memo.depends(&(self.settings.model, self.settings.focal_px));
-        bracket.shaken.retain(|&i| bracket.tsfs[i].is_some());
         Ok(())
     }
 

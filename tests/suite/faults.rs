@@ -214,6 +214,39 @@ fn a_shaken_frame_is_found_beside_one_that_is_surely_sharp() {
     assert!(free > held + 1.0, "{free:.2} dB, {held:.2} taken for sharp");
 }
 
+/// A night of lamps, of which two frames share nothing that both see clearly, and the longer one's trails are the steepest edges of all.
+#[test]
+fn a_shaken_frame_that_cannot_be_compared_is_found() {
+    let tremor = Tremor { extent_px: 6.0, roll_deg: 1.0, offset_px: 2.0, offset_deg: 0.1 };
+    let scene = Drawn::Lamps.draw(192, 144, 48, 2, 2);
+    let made = synth::capture(&scene, &Camera::default(), &[(1.0 / 30.0, None), (0.5, Some(tremor))], 0.05, 2).unwrap();
+    let settings = Settings { reference: Some(0), ..Settings::default() };
+    let found = merge(&made.bracket, &settings, None);
+    let held = merge(&made.bracket, &Settings { sharp: Some(vec![0, 1]), ..settings }, None);
+    let (free, held) = (decibels(&found, &made.bracket, &made.truth), decibels(&held, &made.bracket, &made.truth));
+    let second = &found.report["frames"][1];
+    println!("{free:.2} dB, {held:.2} taken for sharp; {}", second["triage"]);
+    assert_eq!(second["triage"]["compared"], false, "{}", second["triage"]);
+    assert_eq!(second["sharp"], false, "it moved");
+    assert_eq!(second["used"], true, "{:?}", found.left_out);
+    assert!(free > held + 0.7, "{free:.2} dB, {held:.2} taken for sharp");
+}
+
+/// A room beside its window: nothing that both frames see clearly. Whether the longer one moved is asked; that it is half a pixel off, or that some blur explains a little more of
+/// it, is no motion.
+#[test]
+fn sharp_frames_that_cannot_be_compared_stay_sharp() {
+    for seed in [1, 4] {
+        let scene = Drawn::Window.draw(192, 144, 48, 2, seed);
+        let made = synth::capture(&scene, &Camera::default(), &[(1.0 / 30.0, None), (0.5, None)], 0.05, seed).unwrap();
+        let found = merge(&made.bracket, &Settings { reference: Some(0), ..Settings::default() }, None);
+        let second = &found.report["frames"][1];
+        println!("seed {seed}: {}", second["triage"]);
+        assert_eq!(second["triage"]["compared"].as_bool().unwrap() && second["triage"]["linked"].as_bool().unwrap(), false);
+        assert_eq!(second["sharp"], true, "seed {seed}: {second}");
+    }
+}
+
 /// The second frame lies elsewhere and passes for shaken until it is registered. The shaken one shares its shades with that frame alone.
 #[test]
 fn a_displaced_frame_that_shows_to_be_sharp_helps_to_place_the_others() {

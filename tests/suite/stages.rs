@@ -174,14 +174,18 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
         let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
         let first = noise::estimate(&frames, &exposures, &Response::Linear);
         let still = [DMat3::IDENTITY; 2];
-        let again = noise::of_squares(&frames, &exposures, &Response::Linear, &[1, 0], &still, &first);
+        let again = noise::of_squares(&frames, &exposures, &Response::Linear, &[1, 0], &still, true, &first);
         let ratio = |model: &noise::NoiseModel| model.variance(0.1) / day.noise.variance(0.1);
         assert_eq!(again.is_some(), smoothed, "{quality:?}: {:.2} -> {:?}", ratio(&first), again.map(|m| ratio(&m)));
         if let Some(again) = again {
             assert!(ratio(&first) < 0.6, "{quality:?}: {:.2}", ratio(&first));
             assert!((0.8..1.8).contains(&ratio(&again)), "{quality:?}: {:.2}", ratio(&again));
         }
-        assert_eq!(noise::of_squares(&frames, &exposures, &Response::Linear, &[0], &still, &first), None, "one frame has no difference");
+        assert_eq!(
+            noise::of_squares(&frames, &exposures, &Response::Linear, &[0], &still, true, &first),
+            None,
+            "one frame has no difference"
+        );
     }
     // In the dark of displaced frames as well, where they lie, and nowhere else.
     let (moved, gamma) = ((3.4, -2.7), Response::Gamma(night.gamma));
@@ -190,13 +194,13 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
     let first = noise::NoiseModel { shot: 0.4 * night.noise.shot, read: 0.4 * night.noise.read };
     let found = [moved, (0.0, 0.0)].map(|(x, y)| {
         let motions = [DMat3::IDENTITY, DMat3::from_translation(DVec2::new(x, y))];
-        let again = noise::of_squares(&frames, &exposures, &gamma, &[0, 1], &motions, &first);
+        let again = noise::of_squares(&frames, &exposures, &gamma, &[0, 1], &motions, true, &first);
         again.map(|m| m.variance(0.015) / night.noise.variance(0.015))
     });
     let none = noise::NoiseModel { shot: 1e-4 * night.noise.shot, read: 1e-4 * night.noise.read };
     let motions = [DMat3::IDENTITY, DMat3::from_translation(DVec2::new(moved.0, moved.1))];
     let limited =
-        noise::of_squares(&frames, &exposures, &gamma, &[0, 1], &motions, &none).map(|m| m.variance(0.015) / none.variance(0.015));
+        noise::of_squares(&frames, &exposures, &gamma, &[0, 1], &motions, true, &none).map(|m| m.variance(0.015) / none.variance(0.015));
     assert!(limited.is_some_and(|r| (r - 50.0).abs() < 1e-6), "{limited:.2?}: no format takes so much of the noise, something moved");
     assert!(found[0].is_some_and(|r| (0.8..1.5).contains(&r)), "{found:.2?}");
     assert!(found[1].is_some_and(|r| r > 2.0), "{found:.2?}: beside each other they show different things");
@@ -432,6 +436,50 @@ fn trails_of_lamps_are_not_taken_for_fine_structure() {
     }
     assert_eq!(shaken, 96);
     assert!(passed.len() <= 3 && passed.iter().all(|p| p.2 < 12.0), "{passed:?}");
+}
+
+/// Before it is known which frames are sharp: a shaken one, beside a sharp one that JPEG has smoothed, differs from it by its blur where there is texture.
+#[test]
+fn smoothed_noise_is_found_beside_a_shaken_frame() {
+    let camera = noise::NoiseModel::from_electrons(3000.0, 4.0);
+    let (w, h) = (320, 240);
+    // On either side the same levels from above to below: blocks of texture, which the shake smooths away, and half of the picture as good as
+    // flat.
+    let block = |x: usize, y: usize| if (x / 12 + y / 12) % 2 == 0 { 1.3 } else { 0.7 };
+    let level = |x: usize, y: usize| (0.05 + 0.05 * y as f64 / h as f64) * if x < w / 2 { block(x, y) } else { 1.0 };
+    let frame = |exposure_time: f64, seed: u64, shake: usize| {
+        let n = twelve(seed, 3 * w * h);
+        let picture = image::RgbImage::from_fn(w as u32, h as u32, |x, y| {
+            let (x, y) = (x as usize, y as usize);
+            let e = exposure_time * (0..shake).map(|i| level((x + i).min(w - 1), y)).sum::<f64>() / shake as f64;
+            image::Rgb([0, 1, 2].map(|c| {
+                let z = e + camera.variance(e).sqrt() * f64::from(n[3 * (y * w + x) + c]) / 2.0;
+                (z.clamp(0.0, 1.0).sqrt() * 255.0).round() as u8
+            }))
+        });
+        let mut file = Vec::new();
+        picture.write_with_encoder(image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 90)).expect("encodes");
+        let picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
+        let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
+        Frame {
+            name: "left".into(),
+            intensity: Rgb([plane(0), plane(1), plane(2)]),
+            levels: 255,
+            chroma_subsampled: false,
+            lossy: true,
+            exposure_time,
+        }
+    };
+    let response = Response::Gamma(2.0);
+    let frames = [frame(0.25, 700, 1), frame(1.0, 800, 24)];
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &response)).collect();
+    let first = noise::NoiseModel { shot: 0.2 * camera.shot, read: 0.2 * camera.read };
+    let found = [false, true].map(|sharp| {
+        let again = noise::of_squares(&frames, &exposures, &response, &[0, 1], &[DMat3::IDENTITY; 2], sharp, &first);
+        again.map(|m| m.variance(0.015) / camera.variance(0.015))
+    });
+    assert!(found[0].is_some_and(|r| (0.7..1.6).contains(&r)), "{found:.2?}");
+    assert!(found[1].is_some_and(|r| r > 2.0), "{found:.2?}: taken for sharp, its blur passes for noise");
 }
 
 /// Two frames that see the left half clearly, and a long one that sees it white and the right half, which is noise to the others.
