@@ -445,7 +445,7 @@ fn smoothed_noise_is_found_beside_a_shaken_frame() {
     let (w, h) = (320, 240);
     // On either side the same levels from above to below: blocks of texture, which the shake smooths away, and half of the picture as good as
     // flat.
-    let block = |x: usize, y: usize| if (x / 12 + y / 12) % 2 == 0 { 1.3 } else { 0.7 };
+    let block = |x: usize, y: usize| if (x / 12 + y / 12).is_multiple_of(2) { 1.3 } else { 0.7 };
     let level = |x: usize, y: usize| (0.05 + 0.05 * y as f64 / h as f64) * if x < w / 2 { block(x, y) } else { 1.0 };
     let frame = |exposure_time: f64, seed: u64, shake: usize| {
         let n = twelve(seed, 3 * w * h);
