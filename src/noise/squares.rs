@@ -45,18 +45,19 @@ pub fn of_squares(
     model: &NoiseModel,
 ) -> Option<NoiseModel> {
     let of_pair = |(i, j): (usize, usize)| {
-        let in_place = sharp && motions[i] == motions[j];
-        let motion = if motions[i] == motions[j] { DMat3::IDENTITY } else { motions[j] * motions[i].inverse() };
+        let in_place = motions[i] == motions[j];
+        let motion = if in_place { DMat3::IDENTITY } else { motions[j] * motions[i].inverse() };
+        let all_tell = sharp && in_place;
         let mut found = differences(frames, exposures, response, (i, j), &motion, sharp);
-        if !in_place {
+        if !all_tell {
             found = flattest(found);
         }
         let all = bins(found.into_iter().map(|d| d.sample).collect(), &MIDDLE, MANY);
-        all.into_iter().filter(move |s| in_place || s.exposure < FLAT)
+        all.into_iter().filter(move |s| all_tell || s.exposure < FLAT)
     };
     let mut samples: Vec<Sample> = pairs(frames, ids.to_vec()).into_iter().flat_map(of_pair).collect();
-    let in_place = sharp && ids.iter().all(|&i| motions[i] == motions[ids[0]]);
-    if in_place && samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
+    let all_tell = sharp && ids.iter().all(|&i| motions[i] == motions[ids[0]]);
+    if all_tell && samples.iter().filter(|s| s.exposure < DARK).count() >= ENOUGH_DARK {
         samples.retain(|s| s.exposure < DARK);
     }
     let (mut excess, mut count) = (0.0, 0.0);
@@ -67,7 +68,7 @@ pub fn of_squares(
     if samples.is_empty() || excess <= SMOOTHED.ln() * count {
         return None;
     }
-    if in_place {
+    if all_tell {
         return fit(&samples, HALF);
     }
     let more = (excess / count).exp().min(MOST_SMOOTHED);

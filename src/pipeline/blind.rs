@@ -206,6 +206,7 @@ const CLEAR: f64 = 5.0;
 const SURELY_SHAKEN: f64 = 3.0;
 /// Extent beside the frames that stand still, as they are, from which that is confirmed: between the two, since their noise widens it.
 const CONFIRMED: f64 = 2.25;
+
 /// Detail below which a frame that passes for sharp may have moved by a pixel or two, though an edge of it or of another is surely steep: sharp ones in
 /// place mostly measure 1. Being asked costs a sharp frame time alone.
 const LESS_DETAILED: f64 = 0.9;

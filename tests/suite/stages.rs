@@ -124,6 +124,26 @@ fn texture_that_most_blocks_show_is_no_noise() {
     assert!(ratios[0] > 0.6 && ratios[1..].iter().all(|r| (0.8..1.2).contains(r)), "{ratios:.2?} times the true variance");
 }
 
+/// The frame that shows `picture`, which was a JPEG file of this `quality` if one is given.
+fn through_jpeg(picture: &image::RgbImage, quality: Option<u8>, exposure_time: f64) -> Frame {
+    let decoded = quality.map(|quality| {
+        let mut file = Vec::new();
+        picture.write_with_encoder(image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, quality)).expect("encodes");
+        image::load_from_memory(&file).expect("decodes").to_rgb8()
+    });
+    let (w, h) = (picture.width() as usize, picture.height() as usize);
+    let picture = decoded.as_ref().unwrap_or(picture);
+    let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
+    Frame {
+        name: "grey".into(),
+        intensity: Rgb([plane(0), plane(1), plane(2)]),
+        levels: 255,
+        chroma_subsampled: false,
+        lossy: quality.is_some(),
+        exposure_time,
+    }
+}
+
 #[test]
 fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
     struct Film {
@@ -152,22 +172,8 @@ fn noise_that_jpeg_has_smoothed_is_found_by_the_means_of_squares() {
             let z = e + camera.noise.variance(e).sqrt() * f64::from(n[3 * (y * w + x) + c]) / 2.0;
             (z.clamp(0.0, 1.0).powf(1.0 / camera.gamma) * 255.0).round() as u8
         };
-        let mut picture =
-            image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb([0, 1, 2].map(|c| coded(c, x as usize, y as usize))));
-        if let Some(quality) = quality {
-            let mut file = Vec::new();
-            picture.write_with_encoder(image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, quality)).expect("encodes");
-            picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
-        }
-        let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
-        Frame {
-            name: "grey".into(),
-            intensity: Rgb([plane(0), plane(1), plane(2)]),
-            levels: 255,
-            chroma_subsampled: false,
-            lossy: quality.is_some(),
-            exposure_time,
-        }
+        let picture = image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb([0, 1, 2].map(|c| coded(c, x as usize, y as usize))));
+        through_jpeg(&picture, quality, exposure_time)
     };
     for (quality, smoothed) in [(Some(75), true), (Some(90), true), (None, false)] {
         let frames = [frame(0.4, 500, quality, (0.0, 0.0), &day), frame(1.0, 600, quality, (0.0, 0.0), &day)];
@@ -457,18 +463,7 @@ fn smoothed_noise_is_found_beside_a_shaken_frame() {
                 (z.clamp(0.0, 1.0).sqrt() * 255.0).round() as u8
             }))
         });
-        let mut file = Vec::new();
-        picture.write_with_encoder(image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 90)).expect("encodes");
-        let picture = image::load_from_memory(&file).expect("decodes").to_rgb8();
-        let plane = |c: usize| Plane::from_fn(w, h, |x, y| f32::from(picture.get_pixel(x as u32, y as u32).0[c]) / 255.0);
-        Frame {
-            name: "left".into(),
-            intensity: Rgb([plane(0), plane(1), plane(2)]),
-            levels: 255,
-            chroma_subsampled: false,
-            lossy: true,
-            exposure_time,
-        }
+        through_jpeg(&picture, Some(90), exposure_time)
     };
     let response = Response::Gamma(2.0);
     let frames = [frame(0.25, 700, 1), frame(1.0, 800, 24)];
