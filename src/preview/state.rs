@@ -92,8 +92,6 @@ pub struct Running {
     pub divisor: usize,
     /// When the present size began.
     pub began: Instant,
-    /// What is being solved.
-    pub session: Session,
 }
 
 /// A message in the window.
@@ -394,7 +392,6 @@ impl State {
         }
         self.serial += 1;
         let stop = Arc::new(AtomicBool::new(false));
-        let session = self.session.clone();
         self.running = Some(Running {
             serial: self.serial,
             stop: stop.clone(),
@@ -402,10 +399,9 @@ impl State {
             fraction: 0.0,
             divisor: 1,
             began: Instant::now(),
-            session: session.clone(),
         });
         self.messages.retain(|m| !m.passing);
-        self.workers.solve(Request { serial: self.serial, session, noted: self.noted(), stop });
+        self.workers.solve(Request { serial: self.serial, session: self.session.clone(), noted: self.noted(), stop });
     }
 
     pub(super) fn save_to(&mut self, path: &Path) {
