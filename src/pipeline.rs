@@ -377,7 +377,9 @@ impl Run<'_> {
         }
         for &i in &used {
             if !found[i].registered {
-                self.leave_out(i, &found[i].reason)?;
+                if !found[i].doubtful {
+                    self.leave_out(i, &found[i].reason)?;
+                }
                 excluded[i] = true;
             }
         }
@@ -538,7 +540,7 @@ impl Run<'_> {
             verdicts
         };
         self.memo.depends(&(self.settings.alpha, self.settings.deghost, self.settings.blind, self.settings.deblur.interpolation));
-        let used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
+        let mut used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
         for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
             if let Some(tsf) = tsf {
                 *motion = tsf.centre();
@@ -605,6 +607,17 @@ impl Run<'_> {
                 sharp[i] = true;
             }
         }
+        // What no part of a frame tells, its blur may, beside sharp frames.
+        let beside = !unexplained && scene.is_none() && sharp.contains(&true);
+        for (i, found) in self.registrations.clone().iter().enumerate().filter(|(_, found)| found.doubtful) {
+            if beside {
+                used.push(i);
+                verdicts[i].reason = "shaken so far that no part of it tells by itself where it lies".into();
+            } else {
+                self.leave_out(i, &found.reason)?;
+            }
+        }
+        used.sort_unstable();
         let may_have_moved = match &doubt {
             Some(doubt) => !doubt.show_surely_the_same(),
             None => may_doubt && blind::less_detailed(&verdicts, &used),

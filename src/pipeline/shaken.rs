@@ -166,6 +166,7 @@ impl Run<'_> {
             "focal_length": found.focal,
             "models_tried": found.trials,
             "still_worse_by": found.still_worse_by,
+            "blank_worse_by": found.blank_worse_by,
             "estimated_at_scale": found.scale,
             "extent_px": tsf::extent(&found.tsf, latent.width(), latent.height()),
             "residual": found.residual,

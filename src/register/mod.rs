@@ -35,6 +35,8 @@ use serde::Serialize;
 pub struct Registration {
     /// Whether the motion can be relied on; otherwise the frame must not be merged.
     pub registered: bool,
+    /// Whether a frame that is not registered may all the same lie where the motion says: a long blur leaves no part that tells by itself.
+    pub doubtful: bool,
     /// Kind of motion that the evidence asks for.
     pub model: Model,
     /// Homography from the reference to the frame, row by row: pixels, centres at integers, origin at the frame's centre.
@@ -58,6 +60,7 @@ impl Registration {
     fn in_place(method: &'static str, reason: &str) -> Self {
         Self {
             registered: true,
+            doubtful: false,
             model: Model::Identity,
             homography: rows(&DMat3::IDENTITY),
             method,
@@ -298,7 +301,7 @@ impl<'a> Registrar<'a> {
             let (share, count) = direct::explained(&tones[small].0, &tones[small].1, &DMat3::IDENTITY);
             count > SMOOTH_PIXELS && share > SMOOTH
         };
-        let mut reason = String::new();
+        let (mut reason, mut doubtful) = (String::new(), false);
         let (mut model, mut motion) = (model, motion);
         if !fit.usable || parts < LEAST_TILES {
             if smooth() {
@@ -311,6 +314,7 @@ impl<'a> Registrar<'a> {
             if smooth() {
                 (model, motion) = (Model::Identity, DMat3::IDENTITY);
             } else {
+                doubtful = !sharp && self.plausible(&motion);
                 reason = format!(
                     "shows something else, or moved otherwise than as a whole: {:.0} % of its parts fit the other frames",
                     100.0 * agreement
@@ -323,6 +327,7 @@ impl<'a> Registrar<'a> {
         let moved = distance(&motion, &DMat3::IDENTITY, w, h).1;
         Registration {
             registered,
+            doubtful,
             model,
             homography: rows(&motion),
             method,

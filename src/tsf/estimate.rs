@@ -63,8 +63,10 @@ pub struct Estimate {
     pub focal: &'static str,
     /// The models that were tried against held-out differences; empty where the model was given.
     pub trials: Vec<Trial>,
-    /// How much worse than the best of them it explains the frame that it did not move while it was exposed, in the same measure; `None` where none was tried.
-    pub still_worse_by: Option<f64>,
+    /// How much worse than the best of them it explains the frame that it did not move while it was exposed, in the same measure.
+    pub still_worse_by: f64,
+    /// The same of the frame showing nothing at all, no structure: of a frame of another scene about 0, as no blur explains parts that it was not fitted to.
+    pub blank_worse_by: f64,
     /// Frame pixels per pixel of the finest level that the blur needed: 1, 2, 4, ...
     pub scale: usize,
     /// Mean squared residual over variance of the differences that count.
@@ -451,20 +453,20 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         let iterations = if search.is_stopped() { 0 } else { iterations };
         Evidence::new(frame, rows).refine(from, &Chart::new(model, focal / scale, w, h), iterations)
     };
-    let (mut trials, mut still_worse_by) = (Vec::new(), None);
+    let mut trials = Vec::new();
     let (mut model, mut chosen_focal, mut source) = (search.model, focal, if search.focal_px.is_some() { "given" } else { "default" });
-    if search.model == Model::Auto {
-        let held = HeldOut::of(&all, (w, h));
-        let judge = Evidence::new(frame, &held.outside);
-        // Model, focal length, and the residual of each block of held-out differences.
-        type Tried = (Model, f64, Vec<(usize, f64)>);
-        let mut tried: Vec<Tried> = Vec::new();
-        let mut attempt = |model: Model, focal: f64| {
-            let t = fit(&held.inside, model, focal, &start, TRIAL);
-            let blocks = held.blocks(&judge.residual(&t));
-            tried.push((model, focal, blocks.clone()));
-            blocks
-        };
+    let held = HeldOut::of(&all, (w, h));
+    let judge = Evidence::new(frame, &held.outside);
+    // Model, focal length, and the residual of each block of held-out differences.
+    type Tried = (Model, f64, Vec<(usize, f64)>);
+    let mut tried: Vec<Tried> = Vec::new();
+    let mut attempt = |model: Model, focal: f64| {
+        let t = fit(&held.inside, model, focal, &start, TRIAL);
+        let blocks = held.blocks(&judge.residual(&t));
+        tried.push((model, focal, blocks.clone()));
+        blocks
+    };
+    let best = if search.model == Model::Auto {
         attempt(Model::Translation, focal);
         let rigid = attempt(Model::Rigid, focal);
         let turned = attempt(Model::Rotation, focal);
@@ -479,8 +481,6 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         let mean = |t: &[(usize, f64)]| t.iter().map(|v| v.1).sum::<f64>() / t.len().max(1) as f64;
         let better = |a: &[(usize, f64)], b: &[(usize, f64)]| Worse::than(a, b).by.total_cmp(&0.0);
         let best = tried.iter().min_by(|a, b| better(&a.2, &b.2)).expect("several models are tried").clone();
-        let still = fit(&held.inside, Model::Rigid, focal, &Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose"), TRIAL);
-        still_worse_by = Some(Worse::than(&held.blocks(&judge.residual(&still)), &best.2).by);
         let mut forgiven: Vec<(Model, f64)> = Vec::new();
         for (m, f, r) in &tried {
             let worse = Worse::than(r, &best.2);
@@ -497,13 +497,19 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
             chosen_focal = rotations.min_by(|a, b| a.worse_by.total_cmp(&b.worse_by)).map_or(focal, |t| t.focal_px);
             source = "found";
         }
-    }
+        best.2
+    } else {
+        attempt(search.model, focal)
+    };
+    let still = fit(&held.inside, Model::Rigid, focal, &Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose"), TRIAL);
+    let worse_by = |residual: &[f32]| Worse::than(&held.blocks(residual), &best).by;
+    let (still_worse_by, blank_worse_by) = (worse_by(&judge.residual(&still)), worse_by(judge.targets()));
     let here = fit(&all, model, chosen_focal, &start, 10);
     let evidence = Evidence::new(frame, &all);
     let residual = evidence.misfit(&here);
     let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
     let evidence = (mean_square(evidence.targets()) - residual) * all.len() as f64 / numbers as f64;
-    Estimate { tsf: filled(&here, scale), model, focal: source, trials, still_worse_by, scale: 1 << l, residual, evidence }
+    Estimate { tsf: filled(&here, scale), model, focal: source, trials, still_worse_by, blank_worse_by, scale: 1 << l, residual, evidence }
 }
 
 /// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.

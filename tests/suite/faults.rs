@@ -214,6 +214,32 @@ fn a_shaken_frame_is_found_beside_one_that_is_surely_sharp() {
     assert!(free > held + 1.0, "{free:.2} dB, {held:.2} taken for sharp");
 }
 
+/// A blur so long that no part of the frame matches the sharp one places it, and its blur does; a frame of another scene, turned, is placed by neither.
+#[test]
+fn a_frame_shaken_too_far_for_its_parts_to_match_is_placed_by_its_blur() {
+    let tremor = Tremor { extent_px: 24.0, roll_deg: 1.0, offset_px: 2.0, offset_deg: 0.1 };
+    let scene = Drawn::Room.draw(192, 144, 64, 2, 1);
+    let made = synth::capture(&scene, &Camera::default(), &[(1.0 / 30.0, None), (0.5, Some(tremor))], 0.05, 1).unwrap();
+    let settings = Settings { reference: Some(0), ..Settings::default() };
+    let found = merge(&made.bracket, &settings, None);
+    let alone = merge(&made.bracket, &Settings { exclude: vec![1], ..settings.clone() }, None);
+    let (got, alone) = (decibels(&found, &made.bracket, &made.truth), decibels(&alone, &made.bracket, &made.truth));
+    let second = &found.report["frames"][1];
+    println!("{got:.2} dB, {alone:.2} without the shaken frame; {}, {}", second["registration"], second["blur"]["blank_worse_by"]);
+    assert!(second["registration"]["agreement"].as_f64().unwrap() < 0.4, "its parts do not match: {}", second["registration"]);
+    assert_eq!(second["used"], true, "{:?}", found.left_out);
+    assert!(got > alone + 2.0, "{got:.2} dB, {alone:.2} without the shaken frame");
+
+    let mut frames = made.bracket.frames().to_vec();
+    let turned = |p: &Plane| Plane::from_fn(p.width, p.height, |x, y| p.at(p.width - 1 - x, p.height - 1 - y));
+    frames[1].intensity = frames[1].intensity.map_planes(turned);
+    let other = merge(&Bracket::new(frames).unwrap(), &settings, None);
+    assert_eq!(other.left_out.len(), 1, "{}", other.report["frames"][1]);
+    assert!(other.left_out[0].1.contains("shows something else"), "{:?}", other.left_out);
+    let other = decibels(&other, &made.bracket, &made.truth);
+    assert!(other > alone - 0.3, "{other:.2} dB, {alone:.2} without the frame");
+}
+
 /// A night of lamps, of which two frames share nothing that both see clearly, and the longer one's trails are the steepest edges of all.
 #[test]
 fn a_shaken_frame_that_cannot_be_compared_is_found() {

@@ -112,6 +112,24 @@ fn every_model_finds_motion_between_the_poses_of_a_grid() {
 }
 
 #[test]
+fn a_blur_explains_parts_that_it_was_not_fitted_to_and_none_of_another_scene() {
+    let latent = seen(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let truth = path(100.0, |t| Pose::planar(7.0 * t, 3.0 * t * t, t, 1.0));
+    let (blurred, weight) = shaken(&latent, PAD, &truth, SIZE);
+    let other = Plane { data: blurred.data.iter().rev().copied().collect(), ..blurred.clone() };
+    for model in [Model::Rigid, Model::Auto] {
+        let of = |blurred: &Plane| {
+            let frame = WholeFrame { latent: &latent, pad: PAD, blurred, weight: &weight, base: DMat3::IDENTITY };
+            frame.estimate(&search(model, Some(100.0)))
+        };
+        let right = of(&blurred).expect("texture determines it");
+        assert!(right.still_worse_by > 1.0 && right.blank_worse_by > 1.0, "{}: {right:#?}", model.name());
+        let wrong = of(&other).map_or(f64::NEG_INFINITY, |found| found.blank_worse_by);
+        assert!(wrong < 0.15, "{}: of another scene {wrong:.2}", model.name());
+    }
+}
+
+#[test]
 fn the_simplest_model_that_explains_the_frame_is_taken() {
     let latent = seen(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let f = 100.0;
