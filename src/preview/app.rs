@@ -23,7 +23,7 @@ pub struct Kept {
     pub session: Option<(Session, Option<PathBuf>)>,
     /// Why the program ends with an error.
     pub failed: Option<String>,
-    /// How often the device was lost.
+    /// How often the device was lost since anything was solved.
     pub losses: usize,
 }
 
@@ -120,7 +120,12 @@ fn hear(state: &mut State, news: News, ctx: &egui::Context) {
                 }
             }
         }
-        News::Frame(i, picture) => state.pictures.hear_frame(i, picture),
+        News::Frame(of, i, picture) => {
+            // Other frames may have been opened since it was asked for.
+            if state.ready.as_ref().is_some_and(|ready| Arc::ptr_eq(ready, &of)) {
+                state.pictures.hear_frame(i, picture);
+            }
+        }
         News::Overlay(key, overlay) => state.pictures.hear_overlay(key, overlay),
         News::Toned(Ok(toned)) => state.pictures.hear_toned(toned),
         News::Toned(Err(text)) => state.say_of_solution(text, true, None),
@@ -371,6 +376,9 @@ impl App {
     /// Hears what has happened and asks for what is wanted. Draws nothing.
     pub fn think(&mut self, ctx: &egui::Context) {
         while let Ok(news) = self.inbox.try_recv() {
+            if matches!(news, News::Solved(..)) {
+                self.kept.lock().unwrap_or_else(std::sync::PoisonError::into_inner).losses = 0;
+            }
             hear(&mut self.state, news, ctx);
         }
         for shot in &self.state.session.shots {

@@ -305,6 +305,7 @@ impl State {
         self.serial += 1;
         self.history = History::default();
         self.session = session;
+        self.typed.clear();
         self.ready = None;
         self.solved = None;
         self.estimate = None;

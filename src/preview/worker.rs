@@ -209,8 +209,8 @@ pub enum News {
     Solved(u64, Arc<Solved>),
     /// A request is done, or stopped, or failed.
     Ended(u64, Option<Failure>),
-    /// A picture of frame `i`.
-    Frame(usize, Picture),
+    /// A picture of frame `i` of these frames.
+    Frame(Arc<Ready>, usize, Picture),
     /// An overlay that was asked for.
     Overlay(OverlayKey, Overlay),
     /// A picture that was asked for, toned, or why not.
@@ -380,7 +380,7 @@ impl Workers {
             let dt = frame.exposure_time as f32;
             let image = noise::exposure(frame, &ready.opened.response).map_planes(|p| p.map(|v| v / dt));
             if let Ok(picture) = upload(gpu, &image) {
-                tell(News::Frame(i, picture));
+                tell(News::Frame(ready, i, picture));
             }
         });
     }
