@@ -29,7 +29,7 @@ use blind::AllBlurs;
 pub use blind::Blind;
 pub use engine::Engine;
 use engine::Memo;
-use rounds::Sorted;
+use rounds::{Sorted, Turned};
 
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
 #[derive(Clone, Debug)]
@@ -622,7 +622,19 @@ impl Run<'_> {
             Some(doubt) => !doubt.show_surely_the_same(),
             None => may_doubt && blind::less_detailed(&verdicts, &used),
         };
-        self.deblurred(Sorted { verdicts, known, used, sharp, tsfs, scene, centre, reduced, unexplained, may_have_moved })
+        self.deblurred(Sorted {
+            verdicts,
+            known,
+            used,
+            sharp,
+            tsfs,
+            scene,
+            centre,
+            reduced,
+            unexplained,
+            may_have_moved,
+            turned: Turned::Not,
+        })
     }
 
     fn finish(

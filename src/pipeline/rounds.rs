@@ -58,6 +58,17 @@ impl Lay {
     }
 }
 
+/// Whether the only frame that passed for sharp and one that was taken for shaken have changed places.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Turned {
+    /// No; they may.
+    Not,
+    /// Yes; if no blur explains this one either, which passed for sharp, they change back.
+    About(usize),
+    /// And back: it stays so.
+    Back,
+}
+
 /// A bracket of which it is known which frames are sharp.
 pub(super) struct Sorted {
     pub(super) verdicts: Vec<Verdict>,
@@ -75,6 +86,8 @@ pub(super) struct Sorted {
     pub(super) unexplained: bool,
     /// Whether sharp frames may have moved by a pixel or two all the same.
     pub(super) may_have_moved: bool,
+    /// Whether two frames have changed places.
+    pub(super) turned: Turned,
 }
 
 /// What is known of a bracket while irradiance and blurs are looked for in turn.
@@ -99,6 +112,8 @@ struct Known {
     base: Option<Solution>,
     /// Whether the TSFs of all frames come from a smaller size.
     reduced: bool,
+    /// Whether two frames have changed places.
+    turned: Turned,
 }
 
 impl Known {
@@ -113,7 +128,12 @@ enum Rounds {
     Solved(Option<Box<Solution>>),
     /// Frames that lay still after all.
     Lay(Vec<usize>),
+    /// The frame that is to be the sharp one instead.
+    Turn(usize),
 }
+
+/// How much steeper than the sharp frame's the edges of a frame that no blur explains are, at least, for the two to change places.
+const STEEPER: f64 = 0.05;
 
 /// How the sharp frames alone (where none is, all) are solved for.
 struct SharpAlone {
@@ -137,6 +157,11 @@ impl Run<'_> {
         let untold = |i: &usize| bracket.shaken.contains(i) && bracket.tsfs[*i].is_none();
         let lay = |i: &usize| untold(i) || self.lay_still(&AS_WELL, &bracket.still, &bracket.verdicts[*i], &bracket.details[*i]);
         let lay: Vec<usize> = bracket.estimated.iter().copied().filter(lay).collect();
+        if let Turned::About(first) = bracket.turned
+            && lay.contains(&first)
+        {
+            return self.turned(bracket, first, noise);
+        }
         if !lay.is_empty() {
             return self.counted_as_sharp(bracket, &lay, noise, may_have_moved);
         }
@@ -146,12 +171,14 @@ impl Run<'_> {
             && bracket.all().len() > 1
             && let Some(stood) = self.ask_sharp_frames(&mut bracket)?
         {
-            return self.once_more(bracket, &stood, noise, false);
+            let turned = bracket.turned;
+            return self.once_more(bracket, &stood, noise, false, turned);
         }
         let start = bracket.latent.clone();
         let solution = match self.rounds(&mut bracket, &start)? {
             Rounds::Solved(found) => found.map(|found| *found),
             Rounds::Lay(ids) => return self.counted_as_sharp(bracket, &ids, noise, false),
+            Rounds::Turn(i) => return self.turned(bracket, i, noise),
         };
         if bracket.shaken.is_empty() && !unexplained {
             self.find_aliasing(&bracket.still, &bracket.shaken, &bracket.latent, 0.80, 0.90)?;
@@ -206,12 +233,48 @@ impl Run<'_> {
             self.registrations[i] = found[i].clone();
         }
         let sharp = [bracket.still.as_slice(), ids].concat();
-        self.once_more(bracket, &sharp, noise, may_have_moved)
+        let turned = bracket.turned;
+        self.once_more(bracket, &sharp, noise, may_have_moved, turned)
+    }
+
+    /// The irradiance of a bracket whose frame `i` is the sharp one, and the one that passed for it shaken: a long frame that burns out what is bright shows
+    /// more of the dark than a short one, blurred as it is.
+    fn turned(mut self, mut bracket: Known, i: usize, noise: NoiseModel) -> Result<Outcome> {
+        let turned = if bracket.turned == Turned::Not { Turned::About(bracket.still[0]) } else { Turned::Back };
+        for (k, what) in [(i, "sharp"), (bracket.still[0], "shaken")] {
+            bracket.verdicts[k].reason += &match turned {
+                Turned::About(_) => format!(", but as no camera shake explains the steeper of the two it counts as {what}"),
+                _ => format!(", and as that explains no more either it counts as {what} after all"),
+            };
+        }
+        self.progress("looking whether the steeper frame is the sharp one", 0.03)?;
+        self.once_more(bracket, &[i], noise, false, turned)
+    }
+
+    /// The frame that should be the sharp one, if no blur explains any of the frames `hopeless` and nothing but the one frame that passed for sharp is left: that one again
+    /// if the two have changed places, else one whose edges are steeper and whose exposure time is shorter.
+    fn to_turn(&self, bracket: &Known, hopeless: &[usize]) -> Option<usize> {
+        let [still] = bracket.still[..] else { return None };
+        match bracket.turned {
+            Turned::Not => {
+                let all = bracket.shaken.iter().all(|i| hopeless.contains(i));
+                if !all || !self.may_lie(&bracket.still) || bracket.all().iter().any(|&i| bracket.given[i]) {
+                    return None;
+                }
+                let (frames, verdicts) = (self.bracket.frames(), &bracket.verdicts);
+                let better = |&&i: &&usize| {
+                    frames[i].exposure_time < frames[still].exposure_time && verdicts[i].steepness > verdicts[still].steepness + STEEPER
+                };
+                hopeless.iter().find(better).copied()
+            }
+            Turned::About(first) => hopeless.contains(&first).then_some(first),
+            Turned::Back => None,
+        }
     }
 
     /// The irradiance of a bracket of which the frames `sharp` alone are sharp after all, without what was found beside the others. `noise`: its level before it
     /// was measured by the frames that were taken for sharp.
-    fn once_more(mut self, bracket: Known, sharp: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
+    fn once_more(mut self, bracket: Known, sharp: &[usize], noise: NoiseModel, may_have_moved: bool, turned: Turned) -> Result<Outcome> {
         self.memo.depends(&sharp.to_vec());
         self.take_noise(noise);
         self.aliasing.fill(None);
@@ -231,6 +294,7 @@ impl Run<'_> {
             reduced: false,
             unexplained: false,
             may_have_moved,
+            turned,
         })
     }
 
@@ -264,7 +328,7 @@ impl Run<'_> {
 
     /// The sharp frames alone, where no other scene is known: start of the solver, reference of the PSFs, and the result when nothing else helps.
     fn sharp_frames(&mut self, sorted: Sorted, reference: usize) -> Result<(Known, SharpAlone)> {
-        let Sorted { verdicts, known, used, sharp, mut tsfs, scene, reduced, .. } = sorted;
+        let Sorted { verdicts, known, used, sharp, mut tsfs, scene, reduced, turned, .. } = sorted;
         let (still, shaken): (Vec<usize>, Vec<usize>) = used.into_iter().partition(|&i| sharp[i]);
         let frames = if still.is_empty() { shaken.clone() } else { still.clone() };
         self.progress("merging the sharp frames", 0.03)?;
@@ -294,8 +358,22 @@ impl Run<'_> {
         let details = vec![Value::Null; sharp.len()];
         let slight = Vec::new();
         let converged = first == settings;
-        let known =
-            Known { verdicts, given: known, reference, sharp, still, shaken, slight, estimated, tsfs, details, latent, base, reduced };
+        let known = Known {
+            verdicts,
+            given: known,
+            reference,
+            sharp,
+            still,
+            shaken,
+            slight,
+            estimated,
+            tsfs,
+            details,
+            latent,
+            base,
+            reduced,
+            turned,
+        };
         Ok((known, SharpAlone { frames, placed, initial, pad, settings, converged }))
     }
 
@@ -318,7 +396,7 @@ impl Run<'_> {
                 self.registrations[i].reason = "no part of it tells by itself where it lies; its blur does".into();
             }
             let untold = !bracket.verdicts[i].compared && self.may_lie(&bracket.still);
-            if tsf.is_none() && !untold {
+            if tsf.is_none() && !untold && bracket.turned != Turned::About(i) {
                 self.leave_out(
                     i,
                     "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
@@ -381,7 +459,7 @@ impl Run<'_> {
         let begun = if estimated.is_empty() { 0.0 } else { 0.40 };
         while round < rounds && !bracket.shaken.is_empty() {
             let all = bracket.all();
-            let Known { verdicts, given, reference, still, shaken, slight, tsfs, details, latent, base, reduced, .. } = &mut *bracket;
+            let Known { verdicts, reference, still, shaken, slight, tsfs, details, latent, base, reduced, turned, .. } = &mut *bracket;
             let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
             if round > 0 {
                 self.progress("refining the blur", at(0.0))?;
@@ -437,16 +515,20 @@ impl Run<'_> {
             if self.look_for_slight(&ids, start, tsfs, details, at(1.0))? {
                 continue;
             }
-            let lay = |i: &usize| self.lay_still(&NEARLY, still, &verdicts[*i], &details[*i]);
+            let lay = |i: &usize| *turned == Turned::Not && self.lay_still(&NEARLY, still, &verdicts[*i], &details[*i]);
             let lay: Vec<usize> = hopeless.iter().map(|h| h.0).filter(lay).collect();
             if !lay.is_empty() {
                 return Ok(Rounds::Lay(lay));
             }
+            let ids: Vec<usize> = hopeless.iter().map(|h| h.0).collect();
+            if let Some(i) = self.to_turn(bracket, &ids) {
+                return Ok(Rounds::Turn(i));
+            }
             // Deblurring with a blur that does not explain its frame can only harm: without that frame, again.
             for (i, chi) in hopeless {
-                let what = if given[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
+                let what = if bracket.given[i] { "the TSF that was given does not explain it" } else { "no camera shake explains it" };
                 self.leave_out(i, &format!("{what} (its residual is {chi:.1} times its noise)"))?;
-                shaken.retain(|&k| k != i);
+                bracket.shaken.retain(|&k| k != i);
             }
         }
         Ok(Rounds::Solved(solution.map(Box::new)))

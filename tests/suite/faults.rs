@@ -214,6 +214,31 @@ fn a_shaken_frame_is_found_beside_one_that_is_surely_sharp() {
     assert!(free > held + 1.0, "{free:.2} dB, {held:.2} taken for sharp");
 }
 
+/// A room beside its window: the long frame burns it out and shows more of the dark room than the short one, blurred as it is, and passes for the sharp one. That
+/// no blur explains the short frame then tells that it was not.
+#[test]
+fn a_shaken_frame_that_shows_more_does_not_stay_the_sharp_one() {
+    let tremor = Tremor { extent_px: 12.0, roll_deg: 1.0, offset_px: 1.5, offset_deg: 0.1 };
+    let scene = Drawn::Window.draw(192, 144, 48, 2, 1);
+    let made = synth::capture(&scene, &Camera::default(), &[(1.0 / 30.0, None), (0.5, Some(tremor))], 0.05, 1).unwrap();
+    let settings = Settings { reference: Some(0), ..Settings::default() };
+    let found = merge(&made.bracket, &settings, None);
+    let alone = merge(&made.bracket, &Settings { exclude: vec![1], ..settings }, None);
+    let (got, alone) = (decibels(&found, &made.bracket, &made.truth), decibels(&alone, &made.bracket, &made.truth));
+    let frames = &found.report["frames"];
+    println!("{got:.2} dB, {alone:.2} without the shaken frame; {}, {}", frames[0]["triage"], frames[1]["triage"]);
+    assert!(frames[1]["triage"]["detail"].as_f64() > frames[0]["triage"]["detail"].as_f64(), "it shows more");
+    assert_eq!(
+        (&frames[0]["sharp"], &frames[1]["sharp"]),
+        (&true.into(), &false.into()),
+        "{} {}",
+        frames[0]["triage"],
+        frames[1]["triage"]
+    );
+    assert!(found.left_out.is_empty(), "{:?}", found.left_out);
+    assert!(got > alone - 0.3, "{got:.2} dB, {alone:.2} without the shaken frame");
+}
+
 /// A blur so long that no part of the frame matches the sharp one places it, and its blur does; a frame of another scene, turned, is placed by neither.
 #[test]
 fn a_frame_shaken_too_far_for_its_parts_to_match_is_placed_by_its_blur() {
