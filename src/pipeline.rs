@@ -609,12 +609,13 @@ impl Run<'_> {
         }
         // What no part of a frame tells, its blur may, beside sharp frames.
         let beside = !unexplained && scene.is_none() && sharp.contains(&true);
-        for (i, found) in self.registrations.clone().iter().enumerate().filter(|(_, found)| found.doubtful) {
+        let doubtful: Vec<usize> = (0..frames.len()).filter(|&i| self.registrations[i].doubtful).collect();
+        for i in doubtful {
             if beside {
                 used.push(i);
                 verdicts[i].reason = "shaken so far that no part of it tells by itself where it lies".into();
             } else {
-                self.leave_out(i, &found.reason)?;
+                self.leave_out(i, &self.registrations[i].reason.clone())?;
             }
         }
         used.sort_unstable();

@@ -40,7 +40,8 @@ const AS_WELL: Lay = Lay { detail: 0.5, worse: 0.05, uncompared: 0.28, extent: 1
 const NEARLY: Lay = Lay { detail: 0.6, worse: 0.8, uncompared: 0.1, extent: 0.0 };
 
 /// How much worse a frame that no part of it places has to be explained by showing nothing than by its blur, at least: mean logarithm of squared residuals.
-/// Frames blurred by 21 to 32 px, of 192 and 300, measure 0.53 to 2.6; mirrored, turned or 65 px elsewhere at most -0.1.
+/// Frames blurred by 21 to 32 px, of 192 and 300, measure 0.53 to 2.6; mirrored, turned or 65 px elsewhere at most -0.1, and texture
+/// turned 0.05.
 const SHOWN: f64 = 0.25;
 
 impl Lay {
@@ -171,8 +172,7 @@ impl Run<'_> {
             && bracket.all().len() > 1
             && let Some(stood) = self.ask_sharp_frames(&mut bracket)?
         {
-            let turned = bracket.turned;
-            return self.once_more(bracket, &stood, noise, false, turned);
+            return self.once_more(bracket, &stood, noise, false);
         }
         let start = bracket.latent.clone();
         let solution = match self.rounds(&mut bracket, &start)? {
@@ -233,22 +233,21 @@ impl Run<'_> {
             self.registrations[i] = found[i].clone();
         }
         let sharp = [bracket.still.as_slice(), ids].concat();
-        let turned = bracket.turned;
-        self.once_more(bracket, &sharp, noise, may_have_moved, turned)
+        self.once_more(bracket, &sharp, noise, may_have_moved)
     }
 
     /// The irradiance of a bracket whose frame `i` is the sharp one, and the one that passed for it shaken: a long frame that burns out what is bright shows
     /// more of the dark than a short one, blurred as it is.
     fn turned(mut self, mut bracket: Known, i: usize, noise: NoiseModel) -> Result<Outcome> {
-        let turned = if bracket.turned == Turned::Not { Turned::About(bracket.still[0]) } else { Turned::Back };
+        bracket.turned = if bracket.turned == Turned::Not { Turned::About(bracket.still[0]) } else { Turned::Back };
         for (k, what) in [(i, "sharp"), (bracket.still[0], "shaken")] {
-            bracket.verdicts[k].reason += &match turned {
+            bracket.verdicts[k].reason += &match bracket.turned {
                 Turned::About(_) => format!(", but as no camera shake explains the steeper of the two it counts as {what}"),
                 _ => format!(", and as that explains no more either it counts as {what} after all"),
             };
         }
         self.progress("looking whether the steeper frame is the sharp one", 0.03)?;
-        self.once_more(bracket, &[i], noise, false, turned)
+        self.once_more(bracket, &[i], noise, false)
     }
 
     /// The frame that should be the sharp one, if no blur explains any of the frames `hopeless` and nothing but the one frame that passed for sharp is left: that one again
@@ -274,12 +273,12 @@ impl Run<'_> {
 
     /// The irradiance of a bracket of which the frames `sharp` alone are sharp after all, without what was found beside the others. `noise`: its level before it
     /// was measured by the frames that were taken for sharp.
-    fn once_more(mut self, bracket: Known, sharp: &[usize], noise: NoiseModel, may_have_moved: bool, turned: Turned) -> Result<Outcome> {
+    fn once_more(mut self, bracket: Known, sharp: &[usize], noise: NoiseModel, may_have_moved: bool) -> Result<Outcome> {
         self.memo.depends(&sharp.to_vec());
         self.take_noise(noise);
         self.aliasing.fill(None);
         let used = bracket.all();
-        let Known { verdicts, given, sharp: mut flags, mut tsfs, .. } = bracket;
+        let Known { verdicts, given, sharp: mut flags, mut tsfs, turned, .. } = bracket;
         for &i in used.iter().filter(|&&i| !given[i]) {
             (flags[i], tsfs[i]) = (sharp.contains(&i), None);
         }
@@ -648,6 +647,6 @@ mod tests {
         assert!(of(&AS_WELL, 0.57, true, json!(0.002)), "its blur explains nothing");
         assert!(!of(&NEARLY, 1.0, false, json!(0.42)), "nothing says how fine it is");
         assert!(of(&AS_WELL, 1.0, false, json!(0.007)), "but its blur explains nothing");
-        assert!(!of(&AS_WELL, 0.70, true, Value::Null), "nothing was tried: the model was given");
+        assert!(!of(&AS_WELL, 0.70, true, Value::Null), "nothing was tried: the TSF was given");
     }
 }
