@@ -91,12 +91,6 @@ impl Projection {
         Self { h, affine: h.x_axis.z == 0.0 && h.y_axis.z == 0.0 && h.z_axis.z == 1.0 }
     }
 
-    /// Whether it needs no division: even steps stay even.
-    #[inline(always)]
-    pub fn is_affine(&self) -> bool {
-        self.affine
-    }
-
     /// Where it takes `p`.
     #[inline(always)]
     pub fn of(&self, p: DVec2) -> DVec2 {

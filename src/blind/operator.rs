@@ -7,7 +7,6 @@
 //! fit of the TSFs against that luminance by wider ones, and the two drive each other on, round by round.
 
 use crate::image::Plane;
-use crate::pose::Projection;
 use crate::sampling::{split, weights, wide};
 use crate::tsf::{Interpolation, TapSet, Tsf};
 use glam::{DMat3, DVec2};
@@ -60,26 +59,48 @@ impl Default for Cells {
 }
 
 impl Cells {
-    /// From the coordinates of the first and the last pixel of the block, between which they run evenly where `even`; else from that of each
-    /// pixel, `at(k)`, less `slope` k.
+    /// From the coordinate of the first pixel of the block, and how it and the denominator, 1 there, grow from one pixel to the next: pixel k sees
+    /// (`first` + `step` k) / (1 + `turn` k), from which `slope` k is taken.
     #[inline(always)]
-    fn fill(&mut self, first: f64, last: f64, at: impl Fn(usize) -> f64, even: bool, slope: f64) {
+    fn fill(&mut self, first: f64, step: f64, turn: f64, slope: f64) {
         let (from, rest) = split(first);
         self.from = from;
-        let step = ((last - first) / (BLOCK - 1) as f64 - slope) as f32;
-        if even && step.abs() < 1.0 / BLOCK as f32 {
-            for k in 0..BLOCK {
-                let t = rest + step * k as f32;
-                let whole = f32::from(u8::from(t >= 1.0)) - f32::from(u8::from(t < 0.0));
-                (self.whole[k], self.rest[k]) = (whole, t - whole);
-            }
+        // Displacements are small, so that f32 holds them.
+        let (step, bend, turn) = ((step - slope - turn * from as f64) as f32, (-slope * turn) as f32, turn as f32);
+        let at = |k: usize| (rest + (step + bend * k as f32) * k as f32) / (1.0 + turn * k as f32);
+        let near = at(BLOCK - 1) - rest;
+        if turn == 0.0 && near.abs() < 1.0 {
+            self.each(|k| rest + step * k as f32, next_to);
+        } else if near.abs() < 0.5 && turn.abs() * (BLOCK as f32) < 0.05 {
+            // Between its ends a block bulges by less than another half.
+            self.each(at, next_to);
         } else {
-            for k in 0..BLOCK {
-                let (whole, rest) = split(at(k));
-                (self.whole[k], self.rest[k]) = ((whole - from) as f32, rest);
-            }
+            self.each(at, below);
         }
     }
+
+    /// From `at(k)`, the displacement of each pixel, and the whole number `whole(t)` that is not greater.
+    #[inline(always)]
+    fn each(&mut self, at: impl Fn(usize) -> f32, whole: impl Fn(f32) -> f32) {
+        for k in 0..BLOCK {
+            let t = at(k);
+            self.whole[k] = whole(t);
+            self.rest[k] = t - self.whole[k];
+        }
+    }
+}
+
+/// The whole number that is not greater than `t`, of -1 and more and less than 2.
+#[inline(always)]
+fn next_to(t: f32) -> f32 {
+    f32::from(u8::from(t >= 1.0)) - f32::from(u8::from(t < 0.0))
+}
+
+/// The same of any `t`.
+#[inline(always)]
+fn below(t: f32) -> f32 {
+    let towards_zero = (t as i32) as f32;
+    towards_zero - f32::from(u8::from(t < towards_zero))
 }
 
 impl Operator {
@@ -237,17 +258,17 @@ impl Operator {
         let (lw, lh) = (self.latent().0 as isize, self.latent().1 as isize);
         let centre = DVec2::new((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
         let shift = centre + DVec2::splat(self.pad as f64);
-        let inverse = Projection::new(base.inverse);
-        let start = DVec2::new(0.0, j as f64) - DVec2::splat(base.margin as f64) - centre;
-        let look = |i: usize| inverse.of(start + DVec2::new(i as f64, 0.0)) + shift;
+        let (inverse, start) = (&base.inverse, DVec2::new(0.0, j as f64) - DVec2::splat(base.margin as f64) - centre);
         let length = w + 2 * base.margin;
         let (mut along, mut down) = (Cells::default(), Cells::default());
         let (mut x, mut y) = ([[0.0f32; BLOCK]; 4], [[0.0f32; BLOCK]; 4]);
         for block in (0..length).step_by(BLOCK) {
             let count = BLOCK.min(length - block);
-            let (first, last) = (look(block), look(block + BLOCK - 1));
-            along.fill(first.x, last.x, |k| look(block + k).x - k as f64, inverse.is_affine(), 1.0);
-            down.fill(first.y, last.y, |k| look(block + k).y, inverse.is_affine(), 0.0);
+            let seen = *inverse * (start + DVec2::new(block as f64, 0.0)).extend(1.0);
+            let (first, turn) = (seen.truncate() / seen.z + shift, inverse.x_axis.z / seen.z);
+            let step = inverse.x_axis.truncate() / seen.z + shift * turn;
+            along.fill(first.x, step.x, turn, 1.0);
+            down.fill(first.y, step.y, turn, 0.0);
             for k in 0..BLOCK {
                 let (u, v) = (weights(along.rest[k]), weights(down.rest[k]));
                 for a in 0..4 {
