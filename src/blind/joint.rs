@@ -40,7 +40,7 @@ pub struct Joint {
     pub held_out_merge: Vec<f64>,
     /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
     pub if_still: f64,
-    /// What TSFs were fitted to at the second level, the least residual first; none where there is one level, and where frames in doubt stood still.
+    /// What TSFs were fitted to at the second level, or on the one that there is, the least residual first; none where frames in doubt stood still.
     pub ways: Vec<Way>,
 }
 
@@ -92,6 +92,18 @@ impl Freed {
     /// By how much the residuals of all frames (geometric mean) grow if those set free did not move after all, everything else following from there.
     pub fn if_still(&self) -> f64 {
         self.seen.if_still(&self.free)
+    }
+
+    /// The TSFs of all frames so that pixels held out in turn are explained better, and the luminance under them: those fitted to drawn scenes are too
+    /// long. `None` where `progress` returns `false`.
+    pub fn cross_validated(&self, progress: &mut dyn FnMut(Stage) -> bool) -> Option<(Vec<Tsf>, Plane)> {
+        let Look { level, state } = &self.seen;
+        let mut done = 0;
+        let found = level.validated(state, &[], STEPS.0, &mut || {
+            done += 1;
+            progress(Stage { scale: level.scale, fraction: done as f32 / STEPS.0 as f32 })
+        })?;
+        Some(level.on_frame(&found, self.luminance.size()))
     }
 }
 
@@ -188,6 +200,9 @@ fn shrunk(plane: &Plane, scale: usize) -> Plane {
 
 /// Poses of a level `ratio` times coarser on the finer one, each spread over the pixels that its own pixel covers.
 fn spread(tsf: &Tsf, ratio: f64) -> Tsf {
+    if ratio == 1.0 {
+        return tsf.clone();
+    }
     let d = 0.25 * ratio;
     let corners = [(-d, -d), (d, -d), (-d, d), (d, d)];
     let finer = |p: &Pose, (x, y): (f64, f64)| Pose { t_x: p.t_x * ratio + x, t_y: p.t_y * ratio + y, weight: 0.25 * p.weight, ..*p };
@@ -660,11 +675,12 @@ pub fn estimate(
 ) -> Option<Joint> {
     let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
-    let next = (first > last).then_some(first / 2);
+    // Small frames have one level, on which the second's work is done as well.
+    let scale = if first > last { first / 2 } else { first };
     let in_doubt = !doubted.frames.is_empty();
     let search = if look.is_none() { cost(first, ROUNDS.0 * starts.len()) } else { 0.0 };
-    let mut total = search + next.map_or(0.0, |s| cost(first, DRAWN_ROUNDS.0) + cost(s, ROUNDS.1 + DRAWN_ROUNDS.1 + STEPS.0));
-    let mut s = next.unwrap_or(last);
+    let mut total = search + cost(first, DRAWN_ROUNDS.0) + cost(scale, ROUNDS.1 + DRAWN_ROUNDS.1 + STEPS.0);
+    let mut s = scale;
     while s > last {
         s /= 2;
         total += if in_doubt { 2.0 } else { 1.0 } * cost(s, ROUNDS.2);
@@ -680,10 +696,6 @@ pub fn estimate(
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
     let (level, state, ways, if_still) = 'found: {
-        let Some(scale) = next else {
-            let growth = if in_doubt { look.level.growth(&look.state, doubted.frames) } else { 1.0 };
-            break 'found (look.level, look.state, Vec::new(), growth);
-        };
         let level = Level::new(frames, scale, true);
         let fitted_to_best = |advance: &mut dyn FnMut(usize) -> bool| {
             at_finer(&level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))

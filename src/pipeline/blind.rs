@@ -814,8 +814,14 @@ impl Run<'_> {
             }
             return Ok(Some(SetFree::All(Found { start: latent.clone(), tsfs, reference, reduced: true })));
         }
-        let start = self.scene(used, &found.tsfs, &found.luminance, channels);
-        Ok(Some(SetFree::All(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 })))
+        let events = &mut self.events;
+        let (tsfs, luminance) = found
+            .cross_validated(&mut |s| {
+                events(Event::Progress { stage: "refining the blurs by pixels held out".into(), fraction: 0.40 + 0.05 * s.fraction })
+            })
+            .ok_or(Error::Cancelled)?;
+        let start = self.scene(used, &tsfs, &luminance, channels);
+        Ok(Some(SetFree::All(Found { start, tsfs, reference, reduced: found.scale > 1 })))
     }
 
     /// Masks by which the frame `i` alone counts.

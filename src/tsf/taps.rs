@@ -217,7 +217,8 @@ fn roll_bases(tsf: &Tsf, width: usize, height: usize, tolerance: f64) -> Parts {
     (bases, parts)
 }
 
-/// For poses with pitch and yaw: a base for each group of poses whose rotations differ by little more than a translation.
+/// For poses with pitch and yaw: a base for each group of poses whose rotations differ by little more than a translation; for a pose without others one
+/// that holds its translation, too.
 fn general_bases(tsf: &Tsf, width: usize, height: usize, tolerance: f64) -> Parts {
     let (x, y) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
     let samples: Vec<DVec2> =
@@ -244,6 +245,13 @@ fn general_bases(tsf: &Tsf, width: usize, height: usize, tolerance: f64) -> Part
             }
         };
         parts.push((base, DVec2::new(p.t_x, p.t_y) + shift, p.weight));
+    }
+    // Where a base serves one pose it is that pose: nothing is left to be shifted, and one interpolation does.
+    let mut poses = vec![0; bases.len()];
+    parts.iter().for_each(|(base, ..)| poses[*base] += 1);
+    for (base, shift, _) in parts.iter_mut().filter(|(base, ..)| poses[*base] == 1) {
+        bases[*base] = DMat3::from_translation(*shift) * bases[*base];
+        *shift = DVec2::ZERO;
     }
     (bases.into_iter().map(|h| h * tsf.base).collect(), parts)
 }

@@ -26,6 +26,7 @@ fn turned(t: (f64, f64), theta_deg: (f64, f64, f64), weight: f64) -> Pose {
 fn motions(width: usize) -> Vec<(&'static str, Tsf)> {
     let focal = 1.3 * width.max(20) as f64;
     let make = |poses: Vec<Pose>| Tsf::new(focal, poses).expect("valid poses");
+    let same = |x: f64, y: f64, weight: f64| turned((x, y), (0.4, -0.8, 0.3), weight);
     let planar = |p: &[(f64, f64, f64, f64)]| make(p.iter().map(|p| Pose::planar(p.0, p.1, p.2, p.3)).collect());
     vec![
         ("integer shift", planar(&[(3.0, -2.0, 0.0, 1.0)])),
@@ -33,8 +34,9 @@ fn motions(width: usize) -> Vec<(&'static str, Tsf)> {
         ("rotations", planar(&[(0.4, -0.3, -0.7, 0.3), (1.2, 0.8, 0.1, 0.5), (-2.6, 1.1, 0.9, 0.2)])),
         // A row sum of the Jacobian of cos 21° + sin 21° = 1.29: targets lie farther apart than the support.
         ("large rotation", planar(&[(0.3, 0.6, 21.0, 1.0)])),
-        ("pitch and yaw", make(vec![turned((0.2, -0.9), (0.4, -0.8, 0.3), 0.6), turned((-1.3, 0.5), (-1.1, 0.9, -0.5), 0.4)])),
-        ("strong perspective", make(vec![turned((0.4, 0.7), (6.0, -11.0, 4.0), 1.0)])),
+        // Two poses that share a base warp, and one by itself.
+        ("pitch and yaw", make(vec![same(0.2, -0.9, 0.4), same(-2.7, 1.4, 0.2), turned((-1.3, 0.5), (-1.1, 0.9, -0.5), 0.4)])),
+        ("strong perspective", make([(0.4, 0.7), (1.9, -1.2)].map(|t| turned(t, (6.0, -11.0, 4.0), 0.5)).to_vec())),
         ("extreme perspective", make(vec![turned((0.4, 0.7), (-14.0, 24.0, 8.0), 1.0)])),
         ("partly beyond the frame", planar(&[(0.6 * width as f64, 2.3, 0.4, 0.5), (0.2, -3.4, 0.0, 0.5)])),
         ("wholly beyond the frame", planar(&[(2.0 * width as f64 + 40.5, 90.25, 0.0, 1.0)])),

@@ -292,7 +292,8 @@ fn a_look_that_was_taken_serves_the_estimate() {
     assert_eq!(again.luminance.data, whole.luminance.data);
     assert_eq!(again.held_out, whole.held_out);
     let found: Vec<f64> = whole.tsfs.iter().map(|t| tsf::extent(t, SIZE.0, SIZE.1)).collect();
-    assert_eq!(extents, found, "there is one level");
+    assert!(whole.ways.len() == 3, "all is tried on the one level that there is: {:?}", whole.ways);
+    assert!(extents.iter().zip(&found).all(|(a, b)| (a - b).abs() < 2.0), "{extents:.2?}, then {found:.2?}");
 }
 
 /// A lens that is soft leaves edges as soft as shake does; what the frames have in common is no motion of any. Frames as small as these tell so little
@@ -357,6 +358,12 @@ fn frames_set_free_move_if_they_did() {
         error(&both)
     );
     assert!(stood.extents[..2].iter().all(|e| *e < 1.0), "moved by {:.2?} px where nothing moved", stood.extents);
+    assert!(moved.cross_validated(&mut |_| false).is_none(), "it can be cancelled");
+    let (tsfs, luminance) = moved.cross_validated(&mut |_| true).unwrap();
+    let (before, after) = (error(&moved), difference(&luminance, &latent.crop(PAD, PAD, SIZE.0, SIZE.1)));
+    let extents: Vec<f64> = tsfs.iter().map(|t| tsf::extent(t, SIZE.0, SIZE.1)).collect();
+    println!("cross-validated {before:.3} {after:.3} {extents:.2?}");
+    assert!(after < before, "cross-validated the scene is off by {after:.3}, before by {before:.3}");
     // A lens that is soft in all directions alike, its scene without the smoothness that is asked of scenes: blur, but none that tells the frames apart.
     let lens = |base: &Tsf| {
         let around = [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (0.0, 0.0)].map(|(x, y)| Pose::planar(x, y, 0.0, 0.2));
