@@ -236,6 +236,20 @@ fn several_passes_equal_one() {
     }
 }
 
+#[test]
+fn a_base_warp_that_serves_one_pose_is_that_pose() {
+    let of = |poses: &[Pose]| TapSet::shifted(&Tsf::new(40.0, poses.to_vec()).expect("valid"), 33, 21, Interpolation::Bicubic);
+    let (one, other) = (turned((0.2, -0.9), (0.4, -0.8, 0.3), 0.6), turned((-1.3, 0.5), (-1.1, 0.9, -0.5), 0.4));
+    let apart = of(&[one, other]);
+    assert!(apart.is_direct(), "nothing is left to be shifted: {:?}", apart.taps);
+    for (base, pose) in apart.bases.iter().zip([one, other]) {
+        assert!((*base - pose.homography(40.0)).to_cols_array().iter().all(|d| d.abs() < 1e-12), "{base} for {pose:?}");
+    }
+    let shared = of(&[one, other, Pose { t_x: -2.7, ..one }]);
+    let taps = |b: usize| shared.taps.iter().filter(|t| t.base == b).count();
+    assert!(shared.bases.len() == 2 && taps(0) > 16 && taps(1) == 1, "{:?}", shared.taps);
+}
+
 /// 512 base warps are bound at a time.
 #[test]
 fn more_base_warps_than_a_binding_holds_are_done_in_parts() {
