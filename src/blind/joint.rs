@@ -93,29 +93,6 @@ impl Freed {
     pub fn if_still(&self) -> f64 {
         self.seen.if_still(&self.free)
     }
-
-    /// The TSFs of all frames so that pixels held out in turn are explained better: those fitted to drawn scenes are too long. `None` where `progress`
-    /// returns `false`.
-    pub fn cross_validated(&self, progress: &mut dyn FnMut(Stage) -> bool) -> Option<Validated> {
-        let Look { level, state } = &self.seen;
-        let mut done = 0;
-        let found = level.validated(state, &[], STEPS.0, &mut || {
-            done += 1;
-            progress(Stage { scale: level.scale, fraction: done as f32 / STEPS.0 as f32 })
-        })?;
-        let (tsfs, luminance) = level.on_frame(&found, self.luminance.size());
-        Some(Validated { tsfs, luminance, held_out: geometric_mean(&level.judge(&found)) })
-    }
-}
-
-/// What cross-validation makes of what was found once frames that were taken for sharp might move.
-pub struct Validated {
-    /// See [`Joint::tsfs`].
-    pub tsfs: Vec<Tsf>,
-    /// See [`Joint::luminance`].
-    pub luminance: Plane,
-    /// See [`Freed::held_out`].
-    pub held_out: f64,
 }
 
 /// A way to begin.

@@ -14,7 +14,7 @@ mod operator;
 mod patches;
 
 pub use joint::{
-    Doubted, FittedTo, Freed, Joint, Look, Stage, Start, Validated, Way, cross_validated, estimate, fits, fix_warp, freed, geometric_mean,
+    Doubted, FittedTo, Freed, Joint, Look, Stage, Start, Way, cross_validated, estimate, fits, fix_warp, freed, geometric_mean,
 };
 pub use luminance::{Frame, luminance_of};
 pub use operator::Operator;

@@ -183,8 +183,6 @@ const ALIKE: f64 = 0.78;
 const SURELY_ALIKE: f64 = 0.92;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
-/// No frame may have stood still.
-const NOT_IN_DOUBT: Doubted = Doubted { frames: &[], at_most: 0.0 };
 /// Growth of the residuals, if frames did not move, up to which they did not.
 struct StoodStill {
     /// Of one frame whose edges are uneven.
@@ -514,12 +512,10 @@ impl Run<'_> {
         if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
             order = vec![r];
         }
-        order.into_iter().take(2).map(|k| Start { reference: k, luminance: self.alone(used[k], channels) }).collect()
-    }
-
-    /// Irradiance of the frame `i` alone, the mean of `channels`.
-    fn alone(&self, i: usize, channels: Channels) -> Plane {
-        merge::irradiance(self.bracket, &self.exposures, &self.own_masks(i), &self.curves, &[i]).mean_of(channels)
+        let alone = |k: usize| {
+            merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]).mean_of(channels)
+        };
+        order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
     }
 
     /// How far the point `c` of the reference frame (centred pixels) lies from there in frame `i`: to the pixel.
@@ -818,30 +814,8 @@ impl Run<'_> {
             }
             return Ok(Some(SetFree::All(Found { start: latent.clone(), tsfs, reference, reduced: true })));
         }
-        let events = &mut self.events;
-        let mut best = found
-            .cross_validated(&mut |s| {
-                events(Event::Progress { stage: "refining the blurs by pixels held out".into(), fraction: 0.40 + 0.02 * s.fraction })
-            })
-            .ok_or(Error::Cancelled)?;
-        let mut reduced = found.scale > 1;
-        if longest > SURELY_SHAKEN {
-            // Blurs of several pixels are better found from coarse to fine, all of them together.
-            let starts = [Start { reference: centre, luminance: self.alone(reference, channels) }];
-            let events = &mut self.events;
-            let joint = blind::estimate(&frames, &starts, None, &NOT_IN_DOUBT, (&luminance, &known), &mut |s| {
-                let stage = "no frame is sharp after all: estimating all blurs".into();
-                events(Event::Progress { stage, fraction: 0.42 + 0.08 * s.fraction })
-            })
-            .ok_or(Error::Cancelled)?;
-            let held_out = blind::geometric_mean(&joint.held_out);
-            self.blind["set_free"]["held_out_of_all"] = json!([best.held_out, held_out]);
-            if held_out < best.held_out {
-                (best, reduced) = (blind::Validated { tsfs: joint.tsfs, luminance: joint.luminance, held_out }, joint.scale > 1);
-            }
-        }
-        let start = self.scene(used, &best.tsfs, &best.luminance, channels);
-        Ok(Some(SetFree::All(Found { start, tsfs: best.tsfs, reference, reduced })))
+        let start = self.scene(used, &found.tsfs, &found.luminance, channels);
+        Ok(Some(SetFree::All(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 })))
     }
 
     /// Masks by which the frame `i` alone counts.
