@@ -186,7 +186,7 @@ fn shrunk(plane: &Plane, scale: usize) -> Plane {
     if scale == 1 { plane.clone() } else { shrunk(&plane.halved(), scale / 2) }
 }
 
-/// Poses of a level `ratio` times coarser on the finer one, each spread over the pixels that its own pixel covers.
+/// Poses of a level `ratio` times coarser on the finer one, each spread over the pixels that its own pixel covers: over none but itself where both are one.
 fn spread(tsf: &Tsf, ratio: f64) -> Tsf {
     if ratio == 1.0 {
         return tsf.clone();
@@ -664,7 +664,7 @@ pub fn estimate(
     let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     // Small frames have one level, on which the second's work is done as well.
-    let scale = if first > last { first / 2 } else { first };
+    let scale = (first / 2).max(last);
     let in_doubt = !doubted.frames.is_empty();
     let search = if look.is_none() { cost(first, ROUNDS.0 * starts.len()) } else { 0.0 };
     let mut total = search + cost(first, DRAWN_ROUNDS.0) + cost(scale, ROUNDS.1 + DRAWN_ROUNDS.1 + STEPS.0);
