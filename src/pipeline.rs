@@ -22,6 +22,7 @@ use std::time::Instant;
 mod blind;
 mod engine;
 mod observed;
+mod progress;
 mod rounds;
 mod shaken;
 
@@ -29,6 +30,7 @@ use blind::AllBlurs;
 pub use blind::Blind;
 pub use engine::Engine;
 use engine::Memo;
+use progress::Progress;
 use rounds::{Sorted, Turned};
 
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
@@ -110,7 +112,7 @@ impl Settings {
 /// What a running merge tells its caller.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Work goes on: `stage` is what is being done, `fraction` how much of the whole merge is done, 0..=1.
+    /// Work goes on: `stage` is what is being done, `fraction` how much of the whole merge is done, 0..=1, never less than before.
     Progress {
         /// Stage in words.
         stage: String,
@@ -227,6 +229,13 @@ pub fn merge_with(
     let stop = engine.stop.clone();
     let (gpu, kernels, memo) = engine.parts();
     let start = Instant::now();
+    let mut progress = Progress::default();
+    let events = &mut |event| {
+        events(match event {
+            Event::Progress { stage, fraction } => Event::Progress { stage, fraction: progress.at(fraction) },
+            other => other,
+        })
+    };
     // TSFs that are given decide about every stage.
     memo.begin(if given.is_some() { None } else { Some(format!("{name} {:?}", settings.noise)) });
     let (exposures, noise) = memo.prepared(|| {

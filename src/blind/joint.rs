@@ -1,5 +1,6 @@
 //! The joint estimate: luminance and TSFs in turn, from coarse to fine.
 
+use super::lens::behind_lens;
 use super::luminance::{self, Effort, Frame, chi_squared, operators};
 use super::operator::Operator;
 use crate::image::Plane;
@@ -13,6 +14,7 @@ use glam::{DMat3, DVec2};
 use nalgebra::Matrix2;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::cell::Cell;
 
 /// Where the estimate is.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,6 +42,8 @@ pub struct Joint {
     pub held_out_merge: Vec<f64>,
     /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
     pub if_still: f64,
+    /// Standard deviation in pixels of the blur that all frames share and that is not motion: the lens's; 0 where none was found.
+    pub lens_px: f32,
     /// What TSFs were fitted to at the second level, or on the one that there is, the least residual first; none where frames in doubt stood still.
     pub ways: Vec<Way>,
 }
@@ -156,6 +160,10 @@ const FREED: (usize, usize, f64) = (6, 3, 0.97);
 const ALIKE: f64 = 0.1;
 /// Rounds of luminance and TSFs under the assumption that frames did not move.
 const STILLED: usize = 4;
+/// Standard deviations of the lens's blur that are tried at the second level, in pixels of it, and the residuals over those behind the sharper one below which
+/// a softer one is gone on with.
+const LENSES: [f32; 3] = [0.7, 1.0, 1.4];
+const SHARPER: f64 = 0.9;
 /// Seed of the draws.
 const SEED: u64 = 2013;
 /// One pixel of so many is held out.
@@ -252,6 +260,8 @@ struct Level {
     /// Pixels that count for TSFs and for the judgement.
     known: Vec<bool>,
     held: Vec<bool>,
+    /// Standard deviation of the lens's blur in pixels of the level.
+    lens_px: f32,
 }
 
 /// Luminance and TSFs on a level.
@@ -290,7 +300,12 @@ impl Level {
         let known = known(&frames, mask::UNKNOWN / scale + 1);
         // A fixed scatter over rows and columns.
         let held = (0..size.0 * size.1).map(|p| (p % size.0 * 12 + p / size.0 * 5).is_multiple_of(HELD)).collect();
-        Self { scale, pad: radius + 6, frames, size, grid, near, known, held }
+        Self { scale, pad: radius + 6, frames, size, grid, near, known, held, lens_px: 0.0 }
+    }
+
+    /// The luminance as the frames see it.
+    fn seen(&self, latent: &Plane) -> Plane {
+        Plane { data: behind_lens(&latent.data, latent.size(), self.lens_px), ..latent.clone() }
     }
 
     /// The start explains its frame; the other TSFs follow from it.
@@ -307,7 +322,7 @@ impl Level {
     /// Luminance under the TSFs, whose operators are returned.
     fn solve(&self, state: &mut State, smoothness: f32, model_error: f32, outer: usize) -> Vec<Operator> {
         let operators = operators(&state.tsfs, self.size, self.pad);
-        let effort = Effort { lambda: LAMBDA * smoothness, outer, inner: 12, model_error };
+        let effort = Effort { lambda: LAMBDA * smoothness, outer, inner: 12, model_error, lens_px: self.lens_px };
         state.latent = luminance::solve(&self.frames, &operators, &state.latent, &self.held, &effort);
         operators
     }
@@ -322,10 +337,10 @@ impl Level {
     fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>) {
         let operators = self.solve(state, smoothness, model_error, 2);
         let drawn = draws.map(|random| {
-            let effort = Effort { lambda: LAMBDA * smoothness, outer: 1, inner: DRAWN.0, model_error };
+            let effort = Effort { lambda: LAMBDA * smoothness, outer: 1, inner: DRAWN.0, model_error, lens_px: self.lens_px };
             luminance::drawn(&self.frames, &operators, &state.latent, &self.held, &effort, DRAWN.1, random)
         });
-        let latent = drawn.as_ref().unwrap_or(&state.latent);
+        let latent = &self.seen(drawn.as_ref().unwrap_or(&state.latent));
         let fits = self.frames.par_iter().zip(&state.tsfs).map(|(f, t)| self.fit(f, latent, Some(t), model_error));
         let fits: Vec<Option<Tsf>> = fits.collect();
         state.take(fits);
@@ -336,7 +351,7 @@ impl Level {
     /// not move. `None` as for [`at_coarsest`].
     fn validated(&self, state: &State, still: &[usize], steps: usize, going: &mut dyn FnMut() -> bool) -> Option<State> {
         let (w, n) = (self.size.0, self.held.len());
-        let effort = Effort { lambda: LAMBDA, outer: 1, inner: SOLVED, model_error: MODEL_ERROR.1 };
+        let effort = Effort { lambda: LAMBDA, outer: 1, inner: SOLVED, model_error: MODEL_ERROR.1, lens_px: self.lens_px };
         let moves: Vec<bool> = (0..state.tsfs.len()).map(|k| !still.contains(&k)).collect();
         let mut now = state.clone();
         for (tsf, _) in now.tsfs.iter_mut().zip(&moves).filter(|(_, moves)| **moves) {
@@ -367,7 +382,7 @@ impl Level {
             last[k % FOLDS] = Some(found.misfit);
             least = least.min(found.misfit);
             left = (now.clone(), mean.clone());
-            let latent = Latent { irradiance: &now.latent, sensitivity: &found.sensitivity, pad: self.pad };
+            let latent = Latent { irradiance: &self.seen(&now.latent), sensitivity: &found.sensitivity, pad: self.pad };
             let frames = found.unseen.iter().zip(&now.tsfs).zip(&mut strides).zip(&moves);
             let stepped = frames.map(|(((unseen, tsf), stride), moves)| moves.then(|| unseen.step(&latent, tsf, stride)));
             let stepped = stepped.collect();
@@ -411,13 +426,14 @@ impl Level {
         let error = MODEL_ERROR.1;
         for _ in 0..STILLED {
             self.solve(&mut state, 1.0, error, 3);
+            let seen = self.seen(&state.latent);
             let fit = |k: usize| {
                 let (frame, tsf) = (&self.frames[k], &state.tsfs[k]);
                 if !still.contains(&k) {
-                    return self.fit(frame, &state.latent, Some(tsf), error);
+                    return self.fit(frame, &seen, Some(tsf), error);
                 }
                 let weight = self.weight(frame, error);
-                let whole = WholeFrame { latent: &state.latent, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: tsf.base };
+                let whole = WholeFrame { latent: &seen, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: tsf.base };
                 Some(whole.refine(tsf, REFINED.1))
             };
             let fits: Vec<Option<Tsf>> = (0..self.frames.len()).into_par_iter().map(fit).collect();
@@ -459,7 +475,8 @@ impl Level {
     fn judge(&self, state: &State) -> Vec<f64> {
         let chosen: Vec<bool> = self.held.iter().zip(&self.known).map(|(h, k)| *h && *k).collect();
         let operators = operators(&state.tsfs, self.size, self.pad);
-        self.frames.iter().zip(&operators).map(|(f, o)| chi_squared(f, o, &state.latent, &chosen)).collect()
+        let seen = self.seen(&state.latent);
+        self.frames.iter().zip(&operators).map(|(f, o)| chi_squared(f, o, &seen, &chosen)).collect()
     }
 
     /// `state` of the coarser level `from`.
@@ -490,7 +507,7 @@ impl Level {
     /// TSFs and luminance of `state` on frames of `size`, the whole one.
     fn on_frame(&self, state: &State, size: (usize, usize)) -> (Vec<Tsf>, Plane) {
         let tsfs = state.tsfs.iter().map(|t| tsf::filled(t, self.scale as f64)).collect();
-        (tsfs, self.enlarged(&state.latent, self.scale, size, 0))
+        (tsfs, self.enlarged(&self.seen(&state.latent), self.scale, size, 0))
     }
 
     /// `latent` of this level on a grid of `size` plus `pad` pixels on every side, `ratio` of them to one of its own.
@@ -635,7 +652,7 @@ fn at_last(
     advance: &mut dyn FnMut(usize) -> bool,
 ) -> Option<(Level, State)> {
     while level.scale > last {
-        let finer = Level::new(frames, level.scale / 2, true);
+        let finer = Level { lens_px: 2.0 * level.lens_px, ..Level::new(frames, level.scale / 2, true) };
         state = at_finer(&finer, state, &level, ROUNDS.2, draws.as_mut(), &mut || advance(finer.scale))?;
         level = finer;
     }
@@ -667,16 +684,16 @@ pub fn estimate(
     let scale = (first / 2).max(last);
     let in_doubt = !doubted.frames.is_empty();
     let search = if look.is_none() { cost(first, ROUNDS.0 * starts.len()) } else { 0.0 };
-    let mut total = search + cost(first, DRAWN_ROUNDS.0) + cost(scale, ROUNDS.1 + DRAWN_ROUNDS.1 + STEPS.0);
+    let mut total = search + cost(first, DRAWN_ROUNDS.0) + cost(scale, ROUNDS.1 * (1 + LENSES.len()) + DRAWN_ROUNDS.1 + STEPS.0);
     let mut s = scale;
     while s > last {
         s /= 2;
         total += if in_doubt { 2.0 } else { 1.0 } * cost(s, ROUNDS.2);
     }
-    let mut done = 0.0;
+    let (mut done, total) = (0.0, Cell::new(total));
     let mut advance = |scale: usize| {
         done += cost(scale, 1);
-        progress(Stage { scale, fraction: done / total })
+        progress(Stage { scale, fraction: done / total.get() })
     };
 
     let look = match look {
@@ -684,13 +701,13 @@ pub fn estimate(
         None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
     };
     let (level, state, ways, if_still) = 'found: {
-        let level = Level::new(frames, scale, true);
-        let fitted_to_best = |advance: &mut dyn FnMut(usize) -> bool| {
-            at_finer(&level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))
+        let mut level = Level::new(frames, scale, true);
+        let fitted_to_best = |level: &Level, advance: &mut dyn FnMut(usize) -> bool| {
+            at_finer(level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))
         };
         let (mut best, mut growth) = (None, 1.0);
         if in_doubt {
-            let fitted = fitted_to_best(&mut advance)?;
+            let fitted = fitted_to_best(&level, &mut advance)?;
             // Asked of these, since the TSFs of frames that are held still follow by fits to the best scene, too.
             let (level, end) = at_last(frames, level.clone(), fitted.clone(), last, None, &mut advance)?;
             growth = level.growth(&end, doubted.frames);
@@ -705,8 +722,21 @@ pub fn estimate(
         let drawn = drawn_at_coarsest(&look, &mut random, &mut || advance(first))?;
         let best = match best {
             Some(best) => best,
-            None => fitted_to_best(&mut advance)?,
+            None => fitted_to_best(&level, &mut advance)?,
         };
+        // A soft scene makes for TSFs that are too thick, all by the same: these explain the frames less well than a lens does.
+        let mut best = (geometric_mean(&level.judge(&best)), best);
+        for (tried, lens_px) in LENSES.into_iter().enumerate() {
+            let behind = Level { lens_px, ..level.clone() };
+            let fitted = fitted_to_best(&behind, &mut advance)?;
+            let held_out = geometric_mean(&behind.judge(&fitted));
+            if held_out >= SHARPER * best.0 {
+                total.set(total.get() - cost(scale, ROUNDS.1 * (LENSES.len() - 1 - tried)));
+                break;
+            }
+            (level, best) = (behind, (held_out, fitted));
+        }
+        let best = best.1;
         let drawn = at_finer(&level, drawn, &look.level, DRAWN_ROUNDS.1, Some(&mut random), &mut || advance(scale))?;
         let mut ways = Vec::new();
         let mut judged = |fitted_to: FittedTo, state: &State| {
@@ -728,7 +758,8 @@ pub fn estimate(
     level.settle(&mut still);
     let held_out_merge = level.judge(&still);
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
-    Some(Joint { luminance, tsfs, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
+    let lens_px = level.lens_px * level.scale as f32;
+    Some(Joint { luminance, tsfs, lens_px, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
 }
 
 /// Whether frames of this size are worked on as they are, not at a smaller one.

@@ -9,6 +9,7 @@
 //! frame is the identity.
 
 mod joint;
+mod lens;
 mod luminance;
 mod operator;
 mod patches;

@@ -679,6 +679,7 @@ impl Run<'_> {
             "residual_if_still": (!places.is_empty()).then_some(found.if_still),
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
+            "lens_px": found.lens_px,
             "ways": found.ways,
         });
         if !believed && let Some(doubt) = doubt {

@@ -170,6 +170,49 @@ fn scene_and_shakes_are_found_together() {
     }
 }
 
+/// Texture of all sizes down to a pixel, as in nature.
+fn texture(width: usize, height: usize) -> Plane {
+    let grain = |radius: usize, seed: u64| {
+        let side = (2 * radius + 1) as f32;
+        Plane { width, height, data: noise(seed, width * height) }.box_sum(radius).map(|v| 0.4 * v / side)
+    };
+    let scales: Vec<Plane> = [0, 1, 2, 5, 12].into_iter().zip(90..).map(|(radius, seed)| grain(radius, seed)).collect();
+    Plane::from_fn(width, height, |x, y| 0.3 * scales.iter().map(|p| p.at(x, y)).sum::<f32>().exp())
+}
+
+/// All frames behind a lens of 0.8 px: without one of its own the estimate would have a harder scene and TSFs that are thicker by it, and explain the frames less
+/// well.
+#[test]
+fn what_a_lens_does_is_no_motion() {
+    let hard = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let tsfs = shakes();
+    let spread = |t: &Tsf| t.covariance().col(0).x + t.covariance().col(1).y;
+    let found = |latent: &Plane| {
+        let frames = frames(latent, &tsfs);
+        let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
+        let found = blind::estimate(&frames, &starts, None, &all_moved(), (&mean(&frames), &still()), &mut |_| true).unwrap();
+        let truth = latent.crop(PAD, PAD, SIZE.0, SIZE.1);
+        let off = difference(&found.luminance, &truth) / difference(&frames[0].blurred, &truth);
+        let thicker: Vec<f64> = found.tsfs.iter().zip(&tsfs).map(|(f, t)| spread(f) - spread(t)).collect();
+        println!("lens {} px, {off:.2} of the first frame's error, thicker by {thicker:.2?} px^2, {:?}", found.lens_px, found.ways);
+        (found.lens_px, off, thicker)
+    };
+    let weight = |x: isize, y: isize| (-0.5 * (x * x + y * y) as f32 / 0.64).exp();
+    let around: Vec<(isize, isize)> = (-3..=3).flat_map(|y| (-3..=3).map(move |x| (x, y))).collect();
+    let sum: f32 = around.iter().map(|&(x, y)| weight(x, y)).sum();
+    let soft = Plane::from_fn(hard.width, hard.height, |x, y| {
+        let at = |(i, j): (isize, isize)| {
+            hard.at(x.saturating_add_signed(i).min(hard.width - 1), y.saturating_add_signed(j).min(hard.height - 1))
+        };
+        around.iter().map(|&(i, j)| weight(i, j) * at((i, j))).sum::<f32>() / sum
+    });
+    let (lens_px, off, thicker) = found(&soft);
+    assert!((0.5..1.2).contains(&lens_px), "{lens_px} px");
+    assert!(off < 0.6, "{off:.2} of the first frame's error");
+    assert!(thicker.iter().all(|t| *t < 0.64), "thicker by {thicker:.2?} px^2 where the lens has 1.28");
+    assert_eq!(found(&hard).0, 0.0, "hard edges are behind no lens");
+}
+
 /// Whichever comes first.
 #[test]
 fn of_two_starts_the_one_that_explains_more_goes_on() {
