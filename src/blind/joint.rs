@@ -14,6 +14,7 @@ use glam::{DMat3, DVec2};
 use nalgebra::Matrix2;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::borrow::Cow;
 use std::cell::Cell;
 
 /// Where the estimate is.
@@ -304,8 +305,12 @@ impl Level {
     }
 
     /// The luminance as the frames see it.
-    fn seen(&self, latent: &Plane) -> Plane {
-        Plane { data: behind_lens(&latent.data, latent.size(), self.lens_px), ..latent.clone() }
+    fn seen<'a>(&self, latent: &'a Plane) -> Cow<'a, Plane> {
+        let (width, height) = latent.size();
+        match behind_lens(&latent.data, (width, height), self.lens_px) {
+            Cow::Borrowed(_) => Cow::Borrowed(latent),
+            Cow::Owned(data) => Cow::Owned(Plane { width, height, data }),
+        }
     }
 
     /// The start explains its frame; the other TSFs follow from it.

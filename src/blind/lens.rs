@@ -3,11 +3,14 @@
 //! A lens blurs all frames alike, and so does a TSF that is thicker than its path: without a lens of its own the scene comes out harder than it is, and every TSF
 //! thicker by what the lens does. A Gaussian commutes with rotations and shifts, so that it stands before all TSFs.
 
+use std::borrow::Cow;
+
 /// `plane` of the `size` (width, height) under a Gaussian of the standard deviation `px` in pixels, mirrored at the borders: an operator that is its own adjoint. 0
 /// pixels leave all as it is.
-pub(super) fn behind_lens(plane: &[f32], (w, h): (usize, usize), px: f32) -> Vec<f32> {
+pub(super) fn behind_lens<'a>(plane: impl Into<Cow<'a, [f32]>>, (w, h): (usize, usize), px: f32) -> Cow<'a, [f32]> {
+    let plane = plane.into();
     if px == 0.0 {
-        return plane.to_vec();
+        return plane;
     }
     let radius = (3.0 * px).ceil() as isize;
     let mut taps: Vec<f32> = (-radius..=radius).map(|d| (-0.5 * (d as f32 / px).powi(2)).exp()).collect();
@@ -30,7 +33,7 @@ pub(super) fn behind_lens(plane: &[f32], (w, h): (usize, usize), px: f32) -> Vec
             row.iter_mut().zip(from).for_each(|(o, v)| *o += t * v);
         }
     }
-    out
+    Cow::Owned(out)
 }
 
 #[cfg(test)]
@@ -42,8 +45,9 @@ mod tests {
     fn a_lens_is_its_own_adjoint_and_keeps_the_light() {
         for (size, px) in [((1, 1), 0.8), ((2, 1), 1.4), ((7, 5), 0.7), ((3, 9), 2.0), ((11, 8), 0.0)] {
             let n = size.0 * size.1;
-            let columns: Vec<Vec<f32>> =
-                (0..n).map(|i| behind_lens(&(0..n).map(|k| if k == i { 1.0 } else { 0.0 }).collect::<Vec<f32>>(), size, px)).collect();
+            let columns: Vec<Vec<f32>> = (0..n)
+                .map(|i| behind_lens((0..n).map(|k| if k == i { 1.0 } else { 0.0 }).collect::<Vec<f32>>(), size, px).into_owned())
+                .collect();
             for (i, column) in columns.iter().enumerate() {
                 assert!((column.iter().sum::<f32>() - 1.0).abs() < 1e-5, "{size:?}, {px} px: light of pixel {i}");
                 for (k, v) in column.iter().enumerate() {

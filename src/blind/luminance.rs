@@ -10,6 +10,7 @@ use super::operator::Operator;
 use crate::image::{Channels, Plane, Rgb};
 use crate::random::Random;
 use crate::tsf::{Tsf, Unseen};
+use std::borrow::Cow;
 
 /// One frame's luminance at one size.
 #[derive(Clone, Debug)]
@@ -115,7 +116,7 @@ impl<'a> Data<'a> {
         }
     }
 
-    fn behind_lens(&self, v: &[f32]) -> Vec<f32> {
+    fn behind_lens<'v>(&self, v: impl Into<Cow<'v, [f32]>>) -> Cow<'v, [f32]> {
         behind_lens(v, self.size, self.lens_px)
     }
 
@@ -155,7 +156,7 @@ impl<'a> Data<'a> {
             weights.push(weight);
             residuals.push(residual);
         }
-        let diagonal = self.behind_lens(&diagonal);
+        let diagonal = self.behind_lens(diagonal);
         let edge: Vec<f32> = (0..n)
             .map(|p| {
                 let (x, y) = (p % w, p / w);
@@ -205,7 +206,7 @@ impl System<'_> {
             let back = operator.adjoint(&residual.iter().zip(weight).map(|(r, w)| r * w).collect::<Vec<f32>>());
             right.iter_mut().zip(&back).for_each(|(a, b)| *a += b);
         }
-        let mut right = self.data.behind_lens(&right);
+        let mut right = self.data.behind_lens(right).into_owned();
         let mut smoothness = vec![0.0f32; u.len()];
         self.differences(u, &mut smoothness, |w, d| w * d);
         right.iter_mut().zip(self.e.iter().zip(&smoothness)).for_each(|(r, (e, s))| *r = e * *r - s);
@@ -214,7 +215,7 @@ impl System<'_> {
 
     fn product(&self, v: &[f32]) -> Vec<f32> {
         let scaled: Vec<f32> = v.iter().zip(&self.e).map(|(a, b)| a * b).collect();
-        let scaled = self.data.behind_lens(&scaled);
+        let scaled = self.data.behind_lens(scaled);
         let mut out = vec![0.0f32; v.len()];
         for (operator, weight) in self.data.operators.iter().zip(&self.weights) {
             let mut f = operator.forward(&scaled);
@@ -222,7 +223,7 @@ impl System<'_> {
             let back = operator.adjoint(&f);
             out.iter_mut().zip(&back).for_each(|(a, b)| *a += b);
         }
-        let mut out = self.data.behind_lens(&out);
+        let mut out = self.data.behind_lens(out).into_owned();
         out.iter_mut().zip(&self.e).for_each(|(a, b)| *a *= b);
         self.differences(v, &mut out, |w, d| w * d);
         out
@@ -264,7 +265,7 @@ impl System<'_> {
             let noise: Vec<f32> = weight.iter().map(|w| w.sqrt() * random.normal() as f32).collect();
             out.iter_mut().zip(&operator.adjoint(&noise)).for_each(|(a, b)| *a += b);
         }
-        let mut out = self.data.behind_lens(&out);
+        let mut out = self.data.behind_lens(out).into_owned();
         out.iter_mut().zip(&self.e).for_each(|(a, b)| *a *= b);
         self.differences(&vec![0.0; self.e.len()], &mut out, |w, _| w.sqrt() * random.normal() as f32);
         out
@@ -346,8 +347,8 @@ pub fn cross_validated(
         count += weight.iter().filter(|w| **w > 0.0).count() as f64;
         right.iter_mut().zip(&operator.adjoint(&pull)).for_each(|(a, b)| *a += b);
     }
-    let step = system.step(times(&data.behind_lens(&right), &system.e), effort.inner);
-    let sensitivity = Plane { data: data.behind_lens(&times(&step, &system.e)), ..latent.clone() };
+    let step = system.step(times(&data.behind_lens(right), &system.e), effort.inner);
+    let sensitivity = Plane { data: data.behind_lens(times(&step, &system.e)).into_owned(), ..latent.clone() };
     let (width, height) = frames[0].blurred.size();
     let plane = |data| Plane { width, height, data };
     let unseen = (0..frames.len()).zip(weights).map(|(k, weight)| {
@@ -539,7 +540,7 @@ mod tests {
             ahead.iter().zip(&behind).map(|(a, b)| (a - b) / (2.0 * step as f32)).collect()
         };
         let (direct, through) = (&validated.unseen[0].direct.data, &validated.unseen[0].through.data);
-        let seen = Plane { data: behind_lens(&latent.data, (w, h), lens_px), ..latent };
+        let seen = Plane { data: behind_lens(&latent.data, (w, h), lens_px).into_owned(), ..latent };
         let said = -dot(&moved(&seen), direct) - dot(&moved(&validated.sensitivity), through);
         let predicted = at(0.0)[0].forward(&seen.data);
         let residual = frames[0].blurred.data.iter().zip(&predicted).map(|(b, p)| b - p);
