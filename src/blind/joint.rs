@@ -476,6 +476,23 @@ impl Level {
         judge(&self.stilled(state, still)) / judge(state)
     }
 
+    /// See [`Look::if_still_behind_lens`].
+    fn growth_behind_lens(&self, state: &State, still: &[usize]) -> Option<f64> {
+        let mut least = geometric_mean(&self.judge(state));
+        let mut growth = None;
+        for lens_px in LENSES {
+            let behind = Level { lens_px, ..self.clone() };
+            let judge = |still: &[usize]| geometric_mean(&behind.judge(&behind.stilled(state, still)));
+            let moved = judge(&[]);
+            if moved >= SHARPER * least {
+                break;
+            }
+            least = moved;
+            growth = Some(judge(still) / moved);
+        }
+        growth
+    }
+
     /// Mean squared residual over variance of each frame on the held-out pixels.
     fn judge(&self, state: &State) -> Vec<f64> {
         let chosen: Vec<bool> = self.held.iter().zip(&self.known).map(|(h, k)| *h && *k).collect();
@@ -626,6 +643,12 @@ impl Look {
     /// an extent alone does not tell.
     pub fn if_still(&self, still: &[usize]) -> f64 {
         self.level.growth(&self.state, still)
+    }
+
+    /// The same where all frames are behind the lens that explains them best; `None` where none explains them clearly better than motion alone. Beside a motion of
+    /// its own that a frame is given, a lens is no motion of it.
+    pub fn if_still_behind_lens(&self, still: &[usize]) -> Option<f64> {
+        self.level.growth_behind_lens(&self.state, still)
     }
 
     /// Extent of each frame's blur in pixels: for frames of a few hundred pixels enough to know which of them stood still.

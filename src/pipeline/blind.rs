@@ -125,6 +125,8 @@ pub(super) struct Doubt {
     passing: Vec<usize>,
     /// Those of them whose edges are softer in one direction than across it.
     uneven: Vec<usize>,
+    /// Those of them whose edges are equally soft in all directions.
+    even: Vec<usize>,
     /// How alike in their fine structure they are, [`Verdict::alike`], along the chain of them by which they are most so; 0 of one or two: two blurs
     /// may be alike by chance.
     alike: f64,
@@ -139,6 +141,11 @@ impl Doubt {
     /// Whether that holds for motions of a pixel or two as well.
     pub fn show_surely_the_same(&self) -> bool {
         self.alike > SURELY_ALIKE
+    }
+
+    /// Whether it is about one frame without steep edges, as soft in all directions as a lens makes them.
+    fn is_about_a_soft_one(&self) -> bool {
+        self.passing.is_empty() && self.frames.len() == 1 && self.even == self.frames
     }
 
     /// Growth of the residuals, when the frames `still` are held, up to which they did not move.
@@ -183,6 +190,8 @@ const ALIKE: f64 = 0.78;
 const SURELY_ALIKE: f64 = 0.92;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
 const SHAKEN: f64 = 1.5;
+/// No frame may have stood still.
+const ALL_MOVED: Doubted = Doubted { frames: &[], at_most: 0.0 };
 /// Growth of the residuals, if frames did not move, up to which they did not.
 struct StoodStill {
     /// Of one frame whose edges are uneven.
@@ -199,6 +208,8 @@ const STOOD_STILL: StoodStill = StoodStill { uneven: 1.2, alone: 1.5, together: 
 /// Evenness up to which edges are softer in one direction than across it: sharp frames without a surely steep edge measure 0.89 and more (of those
 /// with one, a bridge over water 0.84), shaken ones 0.77 to 1.0.
 const UNEVEN: f64 = 0.86;
+/// Evenness from which the edges of one frame alone, none of them steep, may be a lens's.
+const EVEN: f64 = 0.95;
 /// Growth at the look above which the frames as they are, which tell more, need not be asked.
 const CLEAR: f64 = 5.0;
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
@@ -211,12 +222,18 @@ const CONFIRMED: f64 = 2.25;
 /// place mostly measure 1. Being asked costs a sharp frame time alone.
 const LESS_DETAILED: f64 = 0.9;
 
-/// What frames have to show, once those that were taken for sharp may move, for that to be believed.
+/// What frames show once those that were taken for sharp may move, or have to show for that to be believed.
 struct Shown {
-    /// Residuals over those before, at most.
+    /// Residuals over those before; at most.
     left: f64,
-    /// [`blind::Freed::unlike`], at least.
+    /// [`blind::Freed::unlike`]; at least.
     unlike: f64,
+}
+
+impl Shown {
+    fn reaches(&self, line: &Shown) -> bool {
+        self.left < line.left && self.unlike > line.unlike
+    }
 }
 
 /// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.84 and more, but for a soft lens, 0.65 and a
@@ -237,8 +254,10 @@ const AGREED_BY_NOISE: f64 = 30.0 / 4000.0;
 /// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
 const COSTS: f64 = 1.05;
 
-/// Extent in pixels from which a frame that passes for sharp did not move after all: so long a blur would show in its fine structure.
-const TOO_FAR: f64 = 6.0;
+/// Extent in pixels from which a frame that passes for sharp did not move after all, since so long a blur would show in its fine structure, and what it takes for
+/// it to have moved all the same: behind a lens that is soft by a pixel frames shaken by 6 and 9 px leave 0.40 to 0.69 and differ by 0.35 and more, while those
+/// that stood still differ by 0.08 at most. Not in files that hold colour coarsely: what JPEG makes of lamps passes for 7 px.
+const TOO_FAR: (f64, Shown) = (6.0, Shown { left: 0.72, unlike: 0.25 });
 /// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did, slightly: sharp frames beside one of 1.5
 /// px measure up to 0.9, frames of 1.5 px from 1.45 on. What JPEG makes of lamps seems to move by more.
 const STILL: f64 = 1.2;
@@ -261,7 +280,13 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
     }
     let of = |is: &dyn Fn(usize) -> bool| frames.iter().copied().filter(|&i| is(i)).collect();
     let alike = if frames.len() > 2 { chained(verdicts, &frames) } else { 0.0 };
-    Some(Doubt { passing: of(&|i| sharp[i]), uneven: of(&|i| verdicts[i].evenness < UNEVEN), alike, frames })
+    Some(Doubt {
+        passing: of(&|i| sharp[i]),
+        uneven: of(&|i| verdicts[i].evenness < UNEVEN),
+        even: of(&|i| verdicts[i].evenness > EVEN),
+        alike,
+        frames,
+    })
 }
 
 /// The least [`Verdict::alike`] along the chain of `frames` along which it is greatest.
@@ -305,6 +330,12 @@ pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
 fn to_be_shown(many: usize, coarse: bool) -> Shown {
     let line = if many == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
     if coarse { Shown { left: line.left.min(LEFT_OF_JPEG), unlike: line.unlike.max(UNLIKE_OF_JPEG) } } else { line }
+}
+
+/// Whether so `many` frames set free, the longest blur of which has the extent `longest`, show enough for having moved; `coarse`: see [`to_be_shown`].
+fn show_motion(shown: &Shown, longest: f64, many: usize, coarse: bool) -> bool {
+    let not_too_far = longest < TOO_FAR.0 || (!coarse && shown.reaches(&TOO_FAR.1));
+    longest > SHAKEN && not_too_far && shown.reaches(&to_be_shown(many, coarse))
 }
 
 /// What may be left of frames that agree about a motion, in units of the noise, whose shot noise has the variance `shot` at white.
@@ -405,6 +436,9 @@ impl Run<'_> {
             if doubt.stands(growth, alike) && !(seen.all_moved() && doubt.leaves_open(growth)) {
                 return Ok(AllBlurs::Sharp(alike.clone()));
             }
+            if doubt.is_about_a_soft_one() && self.if_still_behind_lens(seen, alike).is_some_and(|growth| doubt.stands(growth, alike)) {
+                return Ok(AllBlurs::Sharp(alike.clone()));
+            }
             let shaken = seen.beyond(alike, SURELY_SHAKEN);
             let still = without(alike, &shaken);
             // One alone stands still beside another's motion, whatever it did itself.
@@ -452,6 +486,13 @@ impl Run<'_> {
         let places = places(still, &seen.frames);
         let growth = seen.look.if_still(&places);
         self.blind["residual_if_still"] = json!(growth);
+        growth
+    }
+
+    /// The same behind a lens, if there is one.
+    fn if_still_behind_lens(&mut self, seen: &Seen, still: &[usize]) -> Option<f64> {
+        let growth = seen.look.if_still_behind_lens(&places(still, &seen.frames));
+        self.blind["residual_if_still_behind_lens"] = json!(growth);
         growth
     }
 
@@ -512,10 +553,12 @@ impl Run<'_> {
         if let Some(r) = self.settings.reference.and_then(|r| used.iter().position(|&i| i == r)) {
             order = vec![r];
         }
-        let alone = |k: usize| {
-            merge::irradiance(self.bracket, &self.exposures, &self.own_masks(used[k]), &self.curves, &[used[k]]).mean_of(channels)
-        };
-        order.into_iter().take(2).map(|k| Start { reference: k, luminance: alone(k) }).collect()
+        order.into_iter().take(2).map(|k| Start { reference: k, luminance: self.alone(used[k], channels) }).collect()
+    }
+
+    /// Irradiance of the frame `i` alone, the mean of `channels`.
+    fn alone(&self, i: usize, channels: Channels) -> Plane {
+        merge::irradiance(self.bracket, &self.exposures, &self.own_masks(i), &self.curves, &[i]).mean_of(channels)
     }
 
     /// How far the point `c` of the reference frame (centred pixels) lies from there in frame `i`: to the pixel.
@@ -774,10 +817,9 @@ impl Run<'_> {
         })
         .ok_or(Error::Cancelled)?;
         let coarse = used.iter().any(|&i| self.bracket.frames()[i].chroma_subsampled);
-        let line = to_be_shown(places.len(), coarse);
         let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
-        let moved = longest > SHAKEN && longest < TOO_FAR;
-        let likely = moved && found.left < line.left && found.unlike > line.unlike && found.held_out < agreed(self.noise.shot);
+        let shown = Shown { left: found.left, unlike: found.unlike };
+        let likely = show_motion(&shown, longest, places.len(), coarse) && found.held_out < agreed(self.noise.shot);
         let growth = likely.then(|| found.if_still());
         let believed = growth.is_some_and(|growth| growth > COSTS);
         if self.blind.is_null() {
@@ -801,6 +843,28 @@ impl Run<'_> {
             return Ok(Some(SetFree::Beside(stood.iter().map(|&k| used[k]).collect())));
         }
         self.blind["believed"] = json!(true);
+        let (mut tsfs, mut seen, mut scale) = (found.tsfs, found.luminance, found.scale);
+        if longest > SURELY_SHAKEN {
+            // So long a blur comes out too long beside a scene that was taken for sharp, and too thick where a lens is soft, which is how it passed for none.
+            let mut own = self.alone(reference, channels);
+            if let Some(window) = &window {
+                let (x, y) = window.place(centre);
+                own = own.crop(x, y, window.size.0, window.size.1);
+            }
+            let starts = [Start { reference: centre, luminance: own }];
+            let events = &mut self.events;
+            let all = blind::estimate(&frames, &starts, None, &ALL_MOVED, (&luminance, &known), &mut |s| {
+                let stage = "no frame is sharp after all: estimating all blurs".into();
+                events(Event::Progress { stage, fraction: 0.40 + 0.10 * s.fraction })
+            })
+            .ok_or(Error::Cancelled)?;
+            let held_out = blind::geometric_mean(&all.held_out);
+            self.blind["set_free"]["held_out_chi_squared_of_all"] = json!(held_out);
+            if held_out < found.held_out {
+                self.blind["lens_px"] = json!(all.lens_px);
+                (tsfs, seen, scale) = (all.tsfs, all.luminance, all.scale);
+            }
+        }
         if let Some(window) = window {
             // What the window tells of those set free is refined on the frame, with the others. A roll far from the frame's centre is a shift there, and
             // hardly told from one.
@@ -808,15 +872,15 @@ impl Run<'_> {
                 let theta_z_deg = tsf.mean().theta_z_deg;
                 Tsf { poses: tsf.poses.iter().map(|p| Pose { theta_z_deg, ..*p }).collect(), ..tsf.clone() }
             };
-            let lifted = |k: usize| if places.contains(&k) { window.on_frame(k, &level(&found.tsfs[k])) } else { whole[k].clone() };
+            let lifted = |k: usize| if places.contains(&k) { window.on_frame(k, &level(&tsfs[k])) } else { whole[k].clone() };
             let tsfs: Vec<Tsf> = (0..used.len()).map(lifted).collect();
             for (&i, tsf) in used.iter().zip(&tsfs) {
                 self.motions[i] = tsf.centre();
             }
             return Ok(Some(SetFree::All(Found { start: latent.clone(), tsfs, reference, reduced: true })));
         }
-        let start = self.scene(used, &found.tsfs, &found.luminance, channels);
-        Ok(Some(SetFree::All(Found { start, tsfs: found.tsfs, reference, reduced: found.scale > 1 })))
+        let start = self.scene(used, &tsfs, &seen, channels);
+        Ok(Some(SetFree::All(Found { start, tsfs, reference, reduced: scale > 1 })))
     }
 
     /// Masks by which the frame `i` alone counts.
@@ -888,14 +952,22 @@ mod tests {
 
     #[test]
     fn sharp_frames_of_files_with_coarse_colour_are_not_set_free() {
-        let frees = |left: f64, unlike: f64, coarse: bool| {
-            let line = to_be_shown(2, coarse);
-            left < line.left && unlike > line.unlike
-        };
+        let frees = |left: f64, unlike: f64, coarse: bool| show_motion(&Shown { left, unlike }, 2.0, 2, coarse);
         // Two sharp JPEG frames each, of an office and of a still life.
         assert!(!frees(0.76, 0.138, true) && !frees(0.78, 0.130, true));
         assert!(frees(0.64, 0.37, true), "a slight blur in such files");
         assert!(frees(0.76, 0.138, false), "and one in others");
+    }
+
+    #[test]
+    fn frames_seem_to_have_moved_far_only_if_they_show_much() {
+        let frees = |left: f64, unlike: f64, longest: f64, many: usize| show_motion(&Shown { left, unlike }, longest, many, false);
+        // Behind a lens that is soft by a pixel: shaken by up to 7 px, two frames and one.
+        assert!(frees(0.40, 0.35, 9.2, 2) && frees(0.69, 0.56, 7.1, 1));
+        assert!(!frees(0.63, 0.07, 7.0, 1) && !frees(0.66, 0.04, 7.0, 2), "sharp ones behind one");
+        assert!(frees(0.79, 0.3, 5.9, 2) && !frees(0.79, 0.3, 6.1, 2), "so far that it would show");
+        assert!(!show_motion(&Shown { left: 0.4, unlike: 0.35 }, 7.0, 2, true), "lamps in JPEG files");
+        assert!(!frees(0.4, 0.35, 1.4, 2), "hardly at all");
     }
 
     #[test]
@@ -962,6 +1034,7 @@ mod tests {
             frames: frames.to_vec(),
             passing: passing.to_vec(),
             uneven: uneven.to_vec(),
+            even: without(frames, uneven),
         };
         assert!(doubt(&[0], &[0], &[]).leaves_open(1.3), "beside the others' motion it can be held whatever it did");
         assert!(!doubt(&[0], &[0], &[]).leaves_open(0.9), "standing explains more");
@@ -972,7 +1045,7 @@ mod tests {
 
     #[test]
     fn a_frame_whose_edges_are_uneven_has_less_to_show_for_having_moved() {
-        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2], alike: 0.0 };
+        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2], even: vec![0], alike: 0.0 };
         assert!(doubt.stands(1.3, &[0]) && !doubt.stands(1.3, &[1]));
         assert!(doubt.stands(1.1, &[1]), "its residuals hardly grow");
         assert!(!doubt.stands(1.6, &[0]));

@@ -180,6 +180,19 @@ fn texture(width: usize, height: usize) -> Plane {
     Plane::from_fn(width, height, |x, y| 0.3 * scales.iter().map(|p| p.at(x, y)).sum::<f32>().exp())
 }
 
+/// `hard` as a lens shows it whose blur has a standard deviation of `sigma` pixels.
+fn behind_lens(hard: &Plane, sigma: f32) -> Plane {
+    let weight = |x: isize, y: isize| (-0.5 * (x * x + y * y) as f32 / (sigma * sigma)).exp();
+    let around: Vec<(isize, isize)> = (-4..=4).flat_map(|y| (-4..=4).map(move |x| (x, y))).collect();
+    let sum: f32 = around.iter().map(|&(x, y)| weight(x, y)).sum();
+    Plane::from_fn(hard.width, hard.height, |x, y| {
+        let at = |(i, j): (isize, isize)| {
+            hard.at(x.saturating_add_signed(i).min(hard.width - 1), y.saturating_add_signed(j).min(hard.height - 1))
+        };
+        around.iter().map(|&(i, j)| weight(i, j) * at((i, j))).sum::<f32>() / sum
+    })
+}
+
 /// All frames behind a lens of 0.8 px: without one of its own the estimate would have a harder scene and TSFs that are thicker by it, and explain the frames less
 /// well.
 #[test]
@@ -197,15 +210,7 @@ fn what_a_lens_does_is_no_motion() {
         println!("lens {} px, {off:.2} of the first frame's error, thicker by {thicker:.2?} px^2, {:?}", found.lens_px, found.ways);
         (found.lens_px, off, thicker)
     };
-    let weight = |x: isize, y: isize| (-0.5 * (x * x + y * y) as f32 / 0.64).exp();
-    let around: Vec<(isize, isize)> = (-3..=3).flat_map(|y| (-3..=3).map(move |x| (x, y))).collect();
-    let sum: f32 = around.iter().map(|&(x, y)| weight(x, y)).sum();
-    let soft = Plane::from_fn(hard.width, hard.height, |x, y| {
-        let at = |(i, j): (isize, isize)| {
-            hard.at(x.saturating_add_signed(i).min(hard.width - 1), y.saturating_add_signed(j).min(hard.height - 1))
-        };
-        around.iter().map(|&(i, j)| weight(i, j) * at((i, j))).sum::<f32>() / sum
-    });
+    let soft = behind_lens(&hard, 0.8);
     let (lens_px, off, thicker) = found(&soft);
     assert!((0.5..1.2).contains(&lens_px), "{lens_px} px");
     assert!(off < 0.6, "{off:.2} of the first frame's error");
@@ -368,6 +373,26 @@ fn frames_that_stood_still_are_told_from_shaken_ones() {
     let shaken: Vec<f64> = (0..4).map(|k| median(measured.map(|(_, shaken)| shaken[k]))).collect();
     assert!(still.iter().all(|g| *g < 1.5), "frames that stood still: {still:.2?}");
     assert!(shaken.iter().all(|g| *g > 2.0), "shaken ones among them: {shaken:.2?}");
+}
+
+/// One frame stood still behind a soft lens: motion explains the frames better than a scene without a lens does, and no better than one with it.
+#[test]
+fn a_frame_that_stood_still_behind_a_soft_lens_is_told_by_the_lens() {
+    let hard = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
+    let shaken = shakes();
+    let look = |latent: &Plane, tsfs: &[Tsf]| {
+        let frames = frames(latent, tsfs);
+        Look::at(&frames, &[Start { reference: 0, luminance: frames[0].blurred.clone() }], &mut |_| true).unwrap()
+    };
+    let soft = behind_lens(&hard, 0.9);
+    let one_stood = [Tsf::identity(), shaken[0].clone(), shaken[1].clone()];
+    let (stood, moved, no_lens) = (look(&soft, &one_stood), look(&soft, &shaken), look(&hard, &one_stood));
+    let of = |look: &Look, still: &[usize]| (look.if_still(still), look.if_still_behind_lens(still));
+    let (stood, moved, no_lens) = (of(&stood, &[0]), of(&moved, &[0, 1]), of(&no_lens, &[0]));
+    println!("stood {stood:.2?}, moved {moved:.2?}, no lens {no_lens:.2?}");
+    assert!(stood.1.is_some_and(|growth| growth < 1.2 && growth < stood.0 - 0.2), "{stood:.2?}");
+    assert!(moved.1.is_some_and(|growth| growth > 1.5), "{moved:.2?}");
+    assert_eq!(no_lens.1, None, "hard edges are behind no lens");
 }
 
 /// Two frames taken for sharp beside one shaken by some pixels: a slight motion of both is found, and none where there was none.
