@@ -478,17 +478,18 @@ impl Level {
 
     /// See [`Look::if_still_behind_lens`].
     fn growth_behind_lens(&self, state: &State, still: &[usize]) -> Option<f64> {
-        let mut least = geometric_mean(&self.judge(state));
+        // All by as many rounds: they gain by those alone.
+        let judge = |level: &Level, still: &[usize]| geometric_mean(&level.judge(&level.stilled(state, still)));
+        let mut least = judge(self, &[]);
         let mut growth = None;
         for lens_px in LENSES {
             let behind = Level { lens_px, ..self.clone() };
-            let judge = |still: &[usize]| geometric_mean(&behind.judge(&behind.stilled(state, still)));
-            let moved = judge(&[]);
+            let moved = judge(&behind, &[]);
             if moved >= SHARPER * least {
                 break;
             }
             least = moved;
-            growth = Some(judge(still) / moved);
+            growth = Some(judge(&behind, still) / moved);
         }
         growth
     }
