@@ -256,7 +256,7 @@ const COSTS: f64 = 1.05;
 
 /// Extent in pixels from which a frame that passes for sharp did not move after all, since so long a blur would show in its fine structure, and what it takes for
 /// it to have moved all the same: behind a lens that is soft by a pixel frames shaken by 6 and 9 px leave 0.40 to 0.69 and differ by 0.35 and more, while those
-/// that stood still differ by 0.08 at most. Not in files that hold colour coarsely: what JPEG makes of lamps passes for 7 px.
+/// that stood still differ by 0.09 at most or leave 0.84. Not in files that hold colour coarsely: what JPEG makes of lamps passes for 7 px.
 const TOO_FAR: (f64, Shown) = (6.0, Shown { left: 0.72, unlike: 0.25 });
 /// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did, slightly: sharp frames beside one of 1.5
 /// px measure up to 0.9, frames of 1.5 px from 1.45 on. What JPEG makes of lamps seems to move by more.
