@@ -75,6 +75,12 @@ impl Window {
         ((self.at.0 as f64 + self.shifts[k].x) as usize, (self.at.1 as f64 + self.shifts[k].y) as usize)
     }
 
+    /// What it shows of `plane`, the frame `k`'s.
+    fn crop(&self, plane: &Plane, k: usize) -> Plane {
+        let (x, y) = self.place(k);
+        plane.crop(x, y, self.size.0, self.size.1)
+    }
+
     /// The `frames` within it.
     fn cut(&self, frames: &[Frame]) -> Vec<Frame> {
         frames.iter().enumerate().map(|(k, f)| f.crop(self.place(k), self.size)).collect()
@@ -125,8 +131,8 @@ pub(super) struct Doubt {
     passing: Vec<usize>,
     /// Those of them whose edges are softer in one direction than across it.
     uneven: Vec<usize>,
-    /// Those of them whose edges are equally soft in all directions.
-    even: Vec<usize>,
+    /// Whether the edges of all of them are equally soft in all directions.
+    even: bool,
     /// How alike in their fine structure they are, [`Verdict::alike`], along the chain of them by which they are most so; 0 of one or two: two blurs
     /// may be alike by chance.
     alike: f64,
@@ -145,7 +151,7 @@ impl Doubt {
 
     /// Whether it is about one frame without steep edges, as soft in all directions as a lens makes them.
     fn is_about_a_soft_one(&self) -> bool {
-        self.passing.is_empty() && self.frames.len() == 1 && self.even == self.frames
+        self.passing.is_empty() && self.frames.len() == 1 && self.even
     }
 
     /// Growth of the residuals, when the frames `still` are held, up to which they did not move.
@@ -283,7 +289,7 @@ pub(super) fn doubted(verdicts: &[Verdict], sharp: &[bool], used: &[usize]) -> O
     Some(Doubt {
         passing: of(&|i| sharp[i]),
         uneven: of(&|i| verdicts[i].evenness < UNEVEN),
-        even: of(&|i| verdicts[i].evenness > EVEN),
+        even: frames.iter().all(|&i| verdicts[i].evenness > EVEN),
         alike,
         frames,
     })
@@ -610,14 +616,8 @@ impl Run<'_> {
             return Ok(None);
         }
         let cut = window.cut(&whole);
-        let starts: Vec<Start> = self
-            .starts(frames, channels)
-            .into_iter()
-            .map(|s| {
-                let (x, y) = window.place(s.reference);
-                Start { luminance: s.luminance.crop(x, y, ww, wh), ..s }
-            })
-            .collect();
+        let starts: Vec<Start> =
+            self.starts(frames, channels).into_iter().map(|s| Start { luminance: window.crop(&s.luminance, s.reference), ..s }).collect();
         let events = &mut self.events;
         let look = Look::at(&cut, &starts, &mut |s| {
             let stage = "no frame is surely sharp: looking whether all moved".into();
@@ -846,11 +846,8 @@ impl Run<'_> {
         let (mut tsfs, mut seen, mut scale) = (found.tsfs, found.luminance, found.scale);
         if longest > SURELY_SHAKEN {
             // So long a blur comes out too long beside a scene that was taken for sharp, and too thick where a lens is soft, which is how it passed for none.
-            let mut own = self.alone(reference, channels);
-            if let Some(window) = &window {
-                let (x, y) = window.place(centre);
-                own = own.crop(x, y, window.size.0, window.size.1);
-            }
+            let own = self.alone(reference, channels);
+            let own = if let Some(window) = &window { window.crop(&own, centre) } else { own };
             let starts = [Start { reference: centre, luminance: own }];
             let events = &mut self.events;
             let all = blind::estimate(&frames, &starts, None, &ALL_MOVED, (&luminance, &known), &mut |s| {
@@ -1034,7 +1031,7 @@ mod tests {
             frames: frames.to_vec(),
             passing: passing.to_vec(),
             uneven: uneven.to_vec(),
-            even: without(frames, uneven),
+            even: uneven.is_empty(),
         };
         assert!(doubt(&[0], &[0], &[]).leaves_open(1.3), "beside the others' motion it can be held whatever it did");
         assert!(!doubt(&[0], &[0], &[]).leaves_open(0.9), "standing explains more");
@@ -1045,7 +1042,7 @@ mod tests {
 
     #[test]
     fn a_frame_whose_edges_are_uneven_has_less_to_show_for_having_moved() {
-        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2], even: vec![0], alike: 0.0 };
+        let doubt = Doubt { frames: vec![0, 1, 2], passing: vec![0, 1, 2], uneven: vec![1, 2], even: false, alike: 0.0 };
         assert!(doubt.stands(1.3, &[0]) && !doubt.stands(1.3, &[1]));
         assert!(doubt.stands(1.1, &[1]), "its residuals hardly grow");
         assert!(!doubt.stands(1.6, &[0]));
