@@ -21,10 +21,12 @@ use std::time::Instant;
 
 mod blind;
 mod engine;
+mod free;
 mod observed;
 mod progress;
 mod rounds;
 mod shaken;
+mod window;
 
 use blind::AllBlurs;
 pub use blind::Blind;

@@ -27,7 +27,6 @@ pub struct Stage {
 }
 
 /// What was found.
-#[derive(Clone, Debug)]
 pub struct Joint {
     /// One TSF per frame; the mean pose of the reference frame is the identity.
     pub tsfs: Vec<Tsf>,
@@ -47,6 +46,19 @@ pub struct Joint {
     pub lens_px: f32,
     /// What TSFs were fitted to at the second level, or on the one that there is, the least residual first; none where frames in doubt stood still.
     pub ways: Vec<Way>,
+    seen: Look,
+}
+
+impl Joint {
+    /// By how much the residuals of all frames (geometric mean) grow if the frames `still`, positions among them, did not move, behind the lens that was found.
+    pub fn if_held(&self, still: &[usize]) -> f64 {
+        self.seen.if_still(still)
+    }
+
+    /// Extent of each frame's blur in pixels, the lens's not counted.
+    pub fn extents(&self) -> Vec<f64> {
+        self.seen.extents()
+    }
 }
 
 /// What TSFs are fitted to.
@@ -788,7 +800,9 @@ pub fn estimate(
     let held_out_merge = level.judge(&still);
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
     let lens_px = level.lens_px * level.scale as f32;
-    Some(Joint { luminance, tsfs, lens_px, scale: last, reference: state.reference, held_out, held_out_merge, if_still, ways })
+    let reference = state.reference;
+    let seen = Look { level, state };
+    Some(Joint { luminance, tsfs, lens_px, scale: last, reference, held_out, held_out_merge, if_still, ways, seen })
 }
 
 /// Whether frames of this size are worked on as they are, not at a smaller one.

@@ -1,16 +1,15 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run, Settings};
-use crate::blind::{self, Doubted, Frame, Lack, Look, PatchSetup, Start};
+use crate::blind::{self, Doubted, Frame, Joint, Lack, Look, PatchSetup, Start};
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
 use crate::merge;
-use crate::pose::{Pose, project};
 use crate::psf::{self, Patch, Psf};
 use crate::triage::Verdict;
 use crate::tsf::{self, Tsf};
-use glam::{DMat3, DVec2};
+use glam::DVec2;
 use serde_json::{Value, json};
 
 /// What is done when no frame is sharp.
@@ -57,53 +56,6 @@ impl Seen {
     }
 }
 
-/// A part of some frames that lies on the same part of the scene in all of them, to the pixel.
-struct Window {
-    /// Its upper left corner in the reference frame, pixels.
-    at: (usize, usize),
-    /// Its width and height in pixels.
-    size: (usize, usize),
-    /// Its centre in the reference frame, centred pixels.
-    centre: DVec2,
-    /// How far it lies from there in each of the frames, whole pixels.
-    shifts: Vec<DVec2>,
-}
-
-impl Window {
-    /// Its upper left corner in the frame `k` of them.
-    fn place(&self, k: usize) -> (usize, usize) {
-        ((self.at.0 as f64 + self.shifts[k].x) as usize, (self.at.1 as f64 + self.shifts[k].y) as usize)
-    }
-
-    /// What it shows of `plane`, the frame `k`'s.
-    fn crop(&self, plane: &Plane, k: usize) -> Plane {
-        let (x, y) = self.place(k);
-        plane.crop(x, y, self.size.0, self.size.1)
-    }
-
-    /// The `frames` within it.
-    fn cut(&self, frames: &[Frame]) -> Vec<Frame> {
-        frames.iter().enumerate().map(|(k, f)| f.crop(self.place(k), self.size)).collect()
-    }
-
-    /// `tsf` of the frame `k` as the window sees it: exact where it has no rotations out of the image plane, else true at its centre.
-    fn seen(&self, k: usize, tsf: &Tsf) -> Tsf {
-        let here = self.centre + self.shifts[k];
-        tsf.around(here).about(DMat3::from_translation(-here) * tsf.base * DMat3::from_translation(self.centre))
-    }
-
-    /// The way back: `tsf` that was found in the window of the frame `k`, on the frame.
-    fn on_frame(&self, k: usize, tsf: &Tsf) -> Tsf {
-        let here = self.centre + self.shifts[k];
-        tsf.around(-here).about(DMat3::from_translation(here) * tsf.base * DMat3::from_translation(-self.centre))
-    }
-
-    /// Left, top, width and height in the reference frame.
-    fn report(&self) -> [usize; 4] {
-        [self.at.0, self.at.1, self.size.0, self.size.1]
-    }
-}
-
 /// What became of a bracket without a frame that is surely sharp.
 #[derive(Clone)]
 pub(super) enum AllBlurs {
@@ -113,15 +65,6 @@ pub(super) enum AllBlurs {
     Sharp(Vec<usize>),
     /// Nothing is to be deblurred by: what had to be said has been said.
     Unexplained,
-}
-
-/// What frames did that were taken for sharp, where one of them at least moved by a pixel or two.
-#[derive(Clone)]
-pub(super) enum SetFree {
-    /// All of them moved.
-    All(Found),
-    /// These stood still.
-    Beside(Vec<usize>),
 }
 
 /// Frames that may be sharp, of which none surely is.
@@ -195,9 +138,9 @@ const ALIKE: f64 = 0.78;
 /// The same where motions of a pixel or two are out of the question, too: beside a sharp frame 1.5 px leave 0.76 and less.
 const SURELY_ALIKE: f64 = 0.92;
 /// Least extent of the reference frame's blur in pixels for a bracket whose triage was in doubt to count as shaken throughout.
-const SHAKEN: f64 = 1.5;
+pub(super) const SHAKEN: f64 = 1.5;
 /// No frame may have stood still.
-const ALL_MOVED: Doubted = Doubted { frames: &[], at_most: 0.0 };
+pub(super) const ALL_MOVED: Doubted = Doubted { frames: &[], at_most: 0.0 };
 /// Growth of the residuals, if frames did not move, up to which they did not.
 struct StoodStill {
     /// Of one frame whose edges are uneven.
@@ -220,61 +163,20 @@ const EVEN: f64 = 0.95;
 const CLEAR: f64 = 5.0;
 /// Extent from which one of several frames that pass for sharp counts as shaken beside others that stand still: sharp ones that are noisy
 /// measure up to 1.6.
-const SURELY_SHAKEN: f64 = 3.0;
+pub(super) const SURELY_SHAKEN: f64 = 3.0;
 /// Extent beside the frames that stand still, as they are, from which that is confirmed: between the two, since their noise widens it.
 const CONFIRMED: f64 = 2.25;
 
+/// Growth of the residuals behind the lens that all frames share up to which one that is held there stood still: sharp ones measure up to 1.11, frames shaken by 6
+/// px and more 1.31 and more.
+const HELD: f64 = 1.2;
 /// Detail below which a frame that passes for sharp may have moved by a pixel or two, though an edge of it or of another is surely steep: sharp ones in
 /// place mostly measure 1. Being asked costs a sharp frame time alone.
 const LESS_DETAILED: f64 = 0.9;
 
-/// What frames show once those that were taken for sharp may move, or have to show for that to be believed.
-struct Shown {
-    /// Residuals over those before; at most.
-    left: f64,
-    /// [`blind::Freed::unlike`]; at least.
-    unlike: f64,
-}
-
-impl Shown {
-    fn reaches(&self, line: &Shown) -> bool {
-        self.left < line.left && self.unlike > line.unlike
-    }
-}
-
-/// Where one frame was taken for sharp. It shows what the scene's edges are for itself: sharp ones leave 0.84 and more, but for a soft lens, 0.65 and a
-/// blur that is round (0.08); frames of 1.5 px 0.79 to 0.93.
-const ONE_SET_FREE: Shown = Shown { left: 0.80, unlike: 0.25 };
-/// Where several were: sharp ones leave 0.90 and more or, behind a soft lens, 0.39 and more, but blurs alike (0.06 at most); frames of 1.5 and 2 px leave up
-/// to 0.84, differ by 0.14 and more, and cost 1.07 and more.
-const SEVERAL_SET_FREE: Shown = Shown { left: 0.86, unlike: 0.12 };
-/// [`Shown::left`] at most where files hold colour more coarsely than brightness: what JPEG takes from sharp frames differs from one to the next, and passes
-/// for a blur that leaves 0.87 and more.
-const LEFT_OF_JPEG: f64 = 0.80;
-/// [`Shown::unlike`] at least there, for the same reason: sharp frames of such files differ by up to 0.14.
-const UNLIKE_OF_JPEG: f64 = 0.2;
-/// [`blind::Freed::held_out`] at most, whatever the noise: what the frames do not agree about beyond is no motion.
-const AGREED: f64 = 300.0;
-/// The same times the variance of shot noise at white: aliasing leaves up to 9 at a full well of 4000 electrons, and as much more as there is less noise.
-const AGREED_BY_NOISE: f64 = 30.0 / 4000.0;
-/// [`blind::Freed::if_still`], at least: what the others' TSFs gain by the way is no motion of theirs.
-const COSTS: f64 = 1.05;
-
-/// Extent in pixels from which a frame that passes for sharp did not move after all, since so long a blur would show in its fine structure, and what it takes for
-/// it to have moved all the same: behind a lens that is soft by a pixel frames shaken by 6 and 9 px leave 0.40 to 0.69 and differ by 0.35 and more, while those
-/// that stood still differ by 0.09 at most or leave 0.84. Not in files that hold colour coarsely: what JPEG makes of lamps passes for 7 px.
-const TOO_FAR: (f64, Shown) = (6.0, Shown { left: 0.72, unlike: 0.25 });
-/// Extent in pixels up to which a frame stood still, once those that were taken for sharp may move and another did, slightly: sharp frames beside one of 1.5
-/// px measure up to 0.9, frames of 1.5 px from 1.45 on. What JPEG makes of lamps seems to move by more.
-const STILL: f64 = 1.2;
-
-/// Longer and shorter side at most, in pixels, of the part of large frames in which frames that pass for sharp are set free.
-const FREE_WINDOW: (usize, usize) = (540, 360);
 /// Longer and shorter side at most, in pixels, of the part of the frames that is looked at in doubt. Blur that leaves a doubt is a few
 /// pixels long, whatever the frame's size.
 const WINDOW: (usize, usize) = (360, 240);
-/// Least side of it.
-const LEAST_WINDOW: usize = 96;
 /// Displacement in pixels of a frame's window that the search covers.
 const DISPLACED: f64 = 4.0;
 
@@ -332,23 +234,6 @@ pub(super) fn less_detailed(verdicts: &[Verdict], used: &[usize]) -> bool {
     used.iter().map(|&i| &verdicts[i]).any(|v| v.sharp && v.compared && v.detail < LESS_DETAILED)
 }
 
-/// What has to be shown where so `many` frames were taken for sharp; `coarse`: of files that hold colour more coarsely than brightness.
-fn to_be_shown(many: usize, coarse: bool) -> Shown {
-    let line = if many == 1 { ONE_SET_FREE } else { SEVERAL_SET_FREE };
-    if coarse { Shown { left: line.left.min(LEFT_OF_JPEG), unlike: line.unlike.max(UNLIKE_OF_JPEG) } } else { line }
-}
-
-/// Whether so `many` frames set free, the longest blur of which has the extent `longest`, show enough for having moved; `coarse`: see [`to_be_shown`].
-fn show_motion(shown: &Shown, longest: f64, many: usize, coarse: bool) -> bool {
-    let not_too_far = longest < TOO_FAR.0 || (!coarse && shown.reaches(&TOO_FAR.1));
-    longest > SHAKEN && not_too_far && shown.reaches(&to_be_shown(many, coarse))
-}
-
-/// What may be left of frames that agree about a motion, in units of the noise, whose shot noise has the variance `shot` at white.
-fn agreed(shot: f64) -> f64 {
-    AGREED.min(AGREED_BY_NOISE / shot)
-}
-
 /// Those of the frames `passing` that are asked about as they are, after a look by which residuals grow by `growth` if all of `alike` are held: none
 /// where that is clear, unless others were held with them, whose motion says nothing of theirs.
 fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] {
@@ -356,8 +241,20 @@ fn asked<'a>(growth: f64, alike: &[usize], passing: &'a [usize]) -> &'a [usize] 
 }
 
 /// Positions of `some` among `frames`.
-fn places(some: &[usize], frames: &[usize]) -> Vec<usize> {
+pub(super) fn places(some: &[usize], frames: &[usize]) -> Vec<usize> {
     (0..frames.len()).filter(|&k| some.contains(&frames[k])).collect()
+}
+
+/// Those of the frames at `places` that stood still behind the lens that the joint estimate `found`, and the growth of the residuals of all if each is held there.
+/// Where motion alone explains a lens's blur, one that stood still cannot be held.
+pub(super) fn stood_behind_lens(found: &Joint, places: &[usize]) -> (Vec<usize>, Vec<f64>) {
+    let growth: Vec<f64> = places.iter().map(|&k| found.if_held(&[k])).collect();
+    (can_be_held(places, &growth), growth)
+}
+
+/// Those of `places` that can be held behind the lens, since residuals hardly grow.
+fn can_be_held(places: &[usize], growth: &[f64]) -> Vec<usize> {
+    places.iter().zip(growth).filter(|(_, growth)| **growth < HELD).map(|(k, _)| *k).collect()
 }
 
 /// `frames` without those of `others`.
@@ -384,7 +281,7 @@ impl Run<'_> {
     }
 
     /// Luminance of the frames `ids`: the mean of `channels`.
-    fn luminance_frames(&self, ids: &[usize], channels: Channels) -> Vec<Frame> {
+    pub(super) fn luminance_frames(&self, ids: &[usize], channels: Channels) -> Vec<Frame> {
         let masks = self.masks_with(&[], channels);
         let one = |&i: &usize| Frame::new(&self.exposures[i], &masks[i], &self.curves[i], self.bracket.frames()[i].exposure_time, channels);
         ids.iter().map(one).collect()
@@ -563,37 +460,8 @@ impl Run<'_> {
     }
 
     /// Irradiance of the frame `i` alone, the mean of `channels`.
-    fn alone(&self, i: usize, channels: Channels) -> Plane {
+    pub(super) fn alone(&self, i: usize, channels: Channels) -> Plane {
         merge::irradiance(self.bracket, &self.exposures, &self.own_masks(i), &self.curves, &[i]).mean_of(channels)
-    }
-
-    /// How far the point `c` of the reference frame (centred pixels) lies from there in frame `i`: to the pixel.
-    fn shift(&self, i: usize, c: DVec2) -> DVec2 {
-        (project(&self.motions[i], c) - c).round()
-    }
-
-    /// The part with much texture of `frames`, whose luminances are `whole`, of `most` (longer and shorter side) pixels at most; `None` where there is none to be
-    /// had.
-    fn window(&self, frames: &[usize], whole: &[Frame], most: (usize, usize)) -> Option<Window> {
-        let (w, h) = self.bracket.size();
-        let corner = DVec2::new(0.5 * w as f64, 0.5 * h as f64);
-        let corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)].map(|(x, y)| DVec2::new(x, y) * corner);
-        let margin = frames.iter().flat_map(|&i| corners.map(|c| self.shift(i, c).abs())).fold(DVec2::ZERO, DVec2::max);
-        let room = |n: usize, m: f64| n.saturating_sub(2 * m as usize);
-        let (rw, rh) = (room(w, margin.x), room(h, margin.y));
-        let longest = |n: usize, other: usize| n.min(if n >= other { most.0 } else { most.1 });
-        let (ww, wh) = (longest(rw, rh), longest(rh, rw));
-        if ww.min(wh) < LEAST_WINDOW {
-            return None;
-        }
-        let (mx, my) = (margin.x as usize, margin.y as usize);
-        let first = &whole[0];
-        let weight = first.mask.zip(&first.variance, |m, v| m * m / v);
-        let seen = |p: &Plane| p.crop(mx, my, rw, rh);
-        let best = psf::choose(&seen(&first.blurred), &seen(&weight), ww.min(wh), 1).first().copied()?;
-        let (x, y) = (mx + best.x.min(rw - ww), my + best.y.min(rh - wh));
-        let centre = DVec2::new(x as f64 + 0.5 * (ww as f64 - w as f64), y as f64 + 0.5 * (wh as f64 - h as f64));
-        Some(Window { at: (x, y), size: (ww, wh), centre, shifts: frames.iter().map(|&i| self.shift(i, centre)).collect() })
     }
 
     /// A look at `frames`: the joint estimate of a part of the frame with much texture, at its coarsest level; `None` where there is none to be had.
@@ -710,7 +578,10 @@ impl Run<'_> {
         let moved: Vec<usize> = used.iter().zip(&extents).filter(|(_, e)| **e > SHAKEN).map(|(i, _)| *i).collect();
         // The frames as they are tell more than a look at half their size.
         let stood_still = !asked.is_empty() && doubt.is_some_and(|doubt| doubt.stands(found.if_still, asked));
-        let believed = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
+        let all_moved = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
+        let in_question = doubt.filter(|_| all_moved && found.lens_px > 0.0).map(|doubt| &doubt.passing);
+        let held = in_question.map(|passing| stood_behind_lens(&found, &self::places(passing, used)));
+        let believed = all_moved && held.as_ref().is_none_or(|(stood, _)| stood.is_empty());
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],
@@ -723,10 +594,13 @@ impl Run<'_> {
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
             "lens_px": found.lens_px,
+            "residual_if_held_behind_lens": held.as_ref().map(|(_, growth)| growth),
             "ways": found.ways,
         });
         if !believed && let Some(doubt) = doubt {
-            let still = if stood_still {
+            let still = if let Some((stood, _)) = held {
+                stood.iter().map(|&k| used[k]).collect()
+            } else if stood_still {
                 asked.to_vec()
             } else if explained {
                 without(used, &moved)
@@ -750,7 +624,7 @@ impl Run<'_> {
     }
 
     /// `luminance`, the mean of `channels`, in colour, the frames `used` as `tsfs` place them from now on.
-    fn scene(&mut self, used: &[usize], tsfs: &[Tsf], luminance: &Plane, channels: Channels) -> Rgb {
+    pub(super) fn scene(&mut self, used: &[usize], tsfs: &[Tsf], luminance: &Plane, channels: Channels) -> Rgb {
         for (&i, tsf) in used.iter().zip(tsfs) {
             self.motions[i] = tsf.centre();
         }
@@ -785,99 +659,6 @@ impl Run<'_> {
             tsfs[i] = Some(tsf);
         }
         Ok(tsfs)
-    }
-
-    /// Whether some of the frames `still` among those `used`, which were taken for sharp in doubt, moved by a pixel or two: if that explains all frames
-    /// better than the TSFs `tsfs` found while they stood, by more than a harder scene behind a softer lens, which blurs them alike.
-    pub(super) fn set_free(
-        &mut self,
-        used: &[usize],
-        still: &[usize],
-        tsfs: &[Option<Tsf>],
-        latent: &Rgb,
-        reference: usize,
-    ) -> Result<Option<SetFree>> {
-        let Some(centre) = used.iter().position(|&i| i == reference) else { return Ok(None) };
-        let channels = self.most_telling(used, used);
-        let mut frames = self.luminance_frames(used, channels);
-        let mut luminance = latent.mean_of(channels);
-        let whole: Vec<Tsf> = used.iter().map(|&i| tsfs[i].clone().expect("frames without were left out")).collect();
-        let mut known = whole.clone();
-        let places = places(still, used);
-        // At half the size as little does not show.
-        let window = if blind::fits(luminance.size()) { None } else { self.window(used, &frames, FREE_WINDOW) };
-        if let Some(window) = &window {
-            (frames, luminance) = (window.cut(&frames), luminance.crop(window.at.0, window.at.1, window.size.0, window.size.1));
-            known = known.iter().enumerate().map(|(k, t)| window.seen(k, t)).collect();
-        }
-        let events = &mut self.events;
-        let found = blind::freed(&frames, &luminance, &known, &places, centre, &mut |s| {
-            let stage = "looking whether frames that seem sharp moved a little".into();
-            events(Event::Progress { stage, fraction: 0.38 + 0.02 * s.fraction })
-        })
-        .ok_or(Error::Cancelled)?;
-        let coarse = used.iter().any(|&i| self.bracket.frames()[i].chroma_subsampled);
-        let longest = places.iter().map(|&k| found.extents[k]).fold(0.0, f64::max);
-        let shown = Shown { left: found.left, unlike: found.unlike };
-        let likely = show_motion(&shown, longest, places.len(), coarse) && found.held_out < agreed(self.noise.shot);
-        let growth = likely.then(|| found.if_still());
-        let believed = growth.is_some_and(|growth| growth > COSTS);
-        if self.blind.is_null() {
-            // No look was taken before: one frame at least has surely steep edges.
-            self.blind = json!({ "method": "joint", "believed": false, "in_doubt": true });
-        }
-        self.blind["set_free"] = json!({
-            "believed": believed,
-            "held_out_chi_squared": found.held_out,
-            "residual_left": found.left,
-            "unlike": found.unlike,
-            "residual_if_still": growth,
-            "extent_px": found.extents,
-            "window_px": window.as_ref().map(Window::report),
-        });
-        if !believed {
-            return Ok(None);
-        }
-        let (stood, moved) = places.iter().partition::<Vec<usize>, _>(|&&k| found.extents[k] < STILL);
-        if !stood.is_empty() && moved.iter().all(|&k| found.extents[k] < super::shaken::SLIGHT) {
-            return Ok(Some(SetFree::Beside(stood.iter().map(|&k| used[k]).collect())));
-        }
-        self.blind["believed"] = json!(true);
-        let (mut tsfs, mut seen, mut scale) = (found.tsfs, found.luminance, found.scale);
-        if longest > SURELY_SHAKEN {
-            // So long a blur comes out too long beside a scene that was taken for sharp, and too thick where a lens is soft, which is how it passed for none.
-            let own = self.alone(reference, channels);
-            let own = if let Some(window) = &window { window.crop(&own, centre) } else { own };
-            let starts = [Start { reference: centre, luminance: own }];
-            let events = &mut self.events;
-            let all = blind::estimate(&frames, &starts, None, &ALL_MOVED, (&luminance, &known), &mut |s| {
-                let stage = "no frame is sharp after all: estimating all blurs".into();
-                events(Event::Progress { stage, fraction: 0.40 + 0.10 * s.fraction })
-            })
-            .ok_or(Error::Cancelled)?;
-            let held_out = blind::geometric_mean(&all.held_out);
-            self.blind["set_free"]["held_out_chi_squared_of_all"] = json!(held_out);
-            if held_out < found.held_out {
-                self.blind["lens_px"] = json!(all.lens_px);
-                (tsfs, seen, scale) = (all.tsfs, all.luminance, all.scale);
-            }
-        }
-        if let Some(window) = window {
-            // What the window tells of those set free is refined on the frame, with the others. A roll far from the frame's centre is a shift there, and
-            // hardly told from one.
-            let level = |tsf: &Tsf| {
-                let theta_z_deg = tsf.mean().theta_z_deg;
-                Tsf { poses: tsf.poses.iter().map(|p| Pose { theta_z_deg, ..*p }).collect(), ..tsf.clone() }
-            };
-            let lifted = |k: usize| if places.contains(&k) { window.on_frame(k, &level(&tsfs[k])) } else { whole[k].clone() };
-            let tsfs: Vec<Tsf> = (0..used.len()).map(lifted).collect();
-            for (&i, tsf) in used.iter().zip(&tsfs) {
-                self.motions[i] = tsf.centre();
-            }
-            return Ok(Some(SetFree::All(Found { start: latent.clone(), tsfs, reference, reduced: true })));
-        }
-        let start = self.scene(used, &tsfs, &seen, channels);
-        Ok(Some(SetFree::All(Found { start, tsfs, reference, reduced: scale > 1 })))
     }
 
     /// Masks by which the frame `i` alone counts.
@@ -948,34 +729,6 @@ mod tests {
     }
 
     #[test]
-    fn sharp_frames_of_files_with_coarse_colour_are_not_set_free() {
-        let frees = |left: f64, unlike: f64, coarse: bool| show_motion(&Shown { left, unlike }, 2.0, 2, coarse);
-        // Two sharp JPEG frames each, of an office and of a still life.
-        assert!(!frees(0.76, 0.138, true) && !frees(0.78, 0.130, true));
-        assert!(frees(0.64, 0.37, true), "a slight blur in such files");
-        assert!(frees(0.76, 0.138, false), "and one in others");
-    }
-
-    #[test]
-    fn frames_seem_to_have_moved_far_only_if_they_show_much() {
-        let frees = |left: f64, unlike: f64, longest: f64, many: usize| show_motion(&Shown { left, unlike }, longest, many, false);
-        // Behind a lens that is soft by a pixel: shaken by up to 7 px, two frames and one.
-        assert!(frees(0.40, 0.35, 9.2, 2) && frees(0.69, 0.56, 7.1, 1));
-        assert!(!frees(0.63, 0.07, 7.0, 1) && !frees(0.66, 0.04, 7.0, 2), "sharp ones behind one");
-        assert!(frees(0.79, 0.3, 5.9, 2) && !frees(0.79, 0.3, 6.1, 2), "so far that it would show");
-        assert!(!show_motion(&Shown { left: 0.4, unlike: 0.35 }, 7.0, 2, true), "lamps in JPEG files");
-        assert!(!frees(0.4, 0.35, 1.4, 2), "hardly at all");
-    }
-
-    #[test]
-    fn what_aliasing_leaves_is_allowed_by_the_noise() {
-        assert!(agreed(1.0 / 4000.0) > 9.0, "aliasing at a full well of 4000 electrons");
-        assert!(agreed(1.0 / 17_500.0) < 295.0, "flare and a fountain, photographed at night");
-        assert!((agreed(1.0 / 8000.0) / agreed(1.0 / 4000.0) - 2.0).abs() < 1e-9, "half the variance, twice as much");
-        assert!((agreed(1e-9) - 300.0).abs() < 1e-9, "whatever the noise");
-    }
-
-    #[test]
     fn three_frames_that_show_the_same_stood_still() {
         let of = |pairs: &[(usize, usize, f64)], count: usize| {
             let mut all: Vec<Verdict> = (0..count).map(|_| verdict(1.0, 0.5, true)).collect();
@@ -990,38 +743,6 @@ mod tests {
         assert_eq!(of(&[(0, 1, 0.99), (0, 2, 0.5), (1, 2, 0.8)], 3), (0.8, true, false), "a chain by way of the second");
         assert_eq!(of(&[(0, 1, 0.99), (0, 2, 0.6), (1, 2, 0.7)], 3), (0.7, false, false));
         assert_eq!(of(&[(0, 1, 0.99), (2, 3, 0.99)], 4), (0.0, false, false), "nothing tells of one half beside the other");
-    }
-
-    #[test]
-    fn a_window_sees_what_the_frame_sees() {
-        let window =
-            Window { at: (700, 90), size: (320, 240), centre: DVec2::new(360.5, -89.5), shifts: vec![DVec2::ZERO, DVec2::new(-7.0, 3.0)] };
-        let base =
-            DMat3::from_translation(DVec2::new(-6.8, 3.3)) * DMat3::from_angle(0.01) * DMat3::from_translation(DVec2::new(0.2, -0.1));
-        let poses = vec![Pose::planar(1.5, -0.5, 0.3, 0.6), Pose::planar(-2.0, 1.0, -0.2, 0.4)];
-        let tsf = Tsf::new(900.0, poses).unwrap().about(base);
-        let seen = window.seen(1, &tsf);
-        let corner = window.centre + window.shifts[1];
-        for p in [DVec2::ZERO, DVec2::new(-150.0, 100.0), DVec2::new(120.5, -80.25)] {
-            for (here, there) in seen.poses.iter().zip(&tsf.poses) {
-                let found = here.apply(seen.focal_px, project(&seen.base, p));
-                let want = there.apply(tsf.focal_px, project(&tsf.base, p + window.centre)) - corner;
-                assert!((found - want).length() < 1e-9, "{p}: {found} for {want}");
-            }
-        }
-        let back = window.on_frame(1, &seen);
-        for (found, want) in back.poses.iter().zip(&tsf.poses) {
-            assert!(
-                (found.t_x - want.t_x).abs() + (found.t_y - want.t_y).abs() < 1e-9 && found.theta_z_deg == want.theta_z_deg,
-                "{found:?}"
-            );
-        }
-        assert!(back.base.abs_diff_eq(tsf.base, 1e-9), "{}", back.base);
-        // Out of the image plane: true at the window's centre.
-        let turned = Tsf::new(900.0, vec![Pose { theta_x_deg: 0.4, theta_y_deg: -0.3, ..Pose::planar(1.0, 2.0, 0.1, 1.0) }]).unwrap();
-        let (found, pose) = (window.seen(0, &turned), turned.poses[0]);
-        let centre = pose.apply(900.0, window.centre) - window.centre;
-        assert!((found.poses[0].apply(900.0, DVec2::ZERO) - centre).length() < 1e-9, "{found:?}");
     }
 
     #[test]
@@ -1055,6 +776,17 @@ mod tests {
         assert_eq!(asked(20.0, &[0, 1], &[0, 1]), [0; 0], "the look is clear about them");
         assert_eq!(asked(20.0, &[0, 1], &[0]), [0], "what moved may be the other one");
         assert_eq!(asked(20.0, &[0, 1], &[]), [0; 0]);
+    }
+
+    #[test]
+    fn frames_that_can_be_held_behind_the_lens_stood_still() {
+        // Soft scenes, one sharp frame and one that passes for it.
+        assert_eq!(can_be_held(&[0, 1], &[1.061, 1.483]), [0]);
+        assert_eq!(can_be_held(&[0, 1], &[1.112, 1.699]), [0]);
+        assert_eq!(can_be_held(&[0, 2], &[1.9, 1.07]), [2]);
+        // Frames that all moved.
+        assert_eq!(can_be_held(&[0, 1], &[1.366, 4.413]), [0; 0]);
+        assert_eq!(can_be_held(&[0], &[1.314]), [0; 0]);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Irradiance and blurs in turn, from the sharp frames on.
 
-use super::blind::SetFree;
+use super::free::SetFree;
 use super::shaken::{LONG, SLIGHT, UNEXPLAINED, for_estimates, for_first_round};
 use super::{Estimate, Event, Outcome, Run};
 use crate::deblur::{self, Observation, Solution};
