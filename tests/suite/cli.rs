@@ -1,6 +1,6 @@
 //! The program as a user runs it: outputs, messages, exit codes.
 
-use crate::support::files::{Noise, listing, scene, shared, write_png};
+use crate::support::files::{Noise, listing, scene, shared, with_exif, write_png};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output};
@@ -378,6 +378,85 @@ fn merge_writes_irradiance_preview_and_report_whose_tsfs_serve_again() {
     assert!((factor.unwrap() - 1.0 / 30.0).abs() < 1e-8);
     let off = log_difference(&other, &again, 30.0 / 8.0);
     assert!(off < 0.01, "log irradiance differs by {off:.4}");
+}
+
+/// What the blur of the tiny bracket's last frame is looked for with, and what the report says of it.
+#[test]
+fn the_blur_is_looked_for_as_asked() {
+    let dir = tempdir().unwrap();
+    tiny(dir.path(), [0.0, 0.0, 7.0], 0.4);
+    let asked = ["--prior", "tv", "--model", "rotation", "--focal-px", "310", "--patch", "60,40", "--patch", "30,36"];
+    let (_, _, report, _) = merge_tiny(dir.path(), "asked", &asked);
+    let (blur, tsf) = (&report["frames"][2]["blur"], &report["frames"][2]["tsf"]);
+    assert_eq!((&blur["model"], &blur["focal_length"], &blur["focal_px"]), (&json!("rotation"), &json!("given"), &json!(310.0)), "{blur}");
+    assert_eq!(tsf["focal_px"], 310.0);
+    let angle = |p: &Value, key: &str| p[key].as_f64().unwrap_or(0.0).abs();
+    let poses = tsf["poses"].as_array().unwrap();
+    assert!(poses.iter().all(|p| angle(p, "t_x") + angle(p, "t_y") < 1e-9), "rotations alone: {tsf}");
+    // A shift of 7 px is 1.3 degrees of 310 px.
+    assert!(poses.iter().any(|p| angle(p, "theta_x_deg").max(angle(p, "theta_y_deg")) > 0.3), "{tsf}");
+    let patches = blur["patches"].as_array().unwrap();
+    assert_eq!(patches.len(), 2, "{patches:?}");
+    for (patch, (x, y)) in patches.iter().zip([(60, 40), (30, 36)]) {
+        let number = |key: &str| patch[key].as_f64().unwrap();
+        let within = |start: f64, at: i32| start <= f64::from(at) && f64::from(at) < start + number("size");
+        assert!(within(number("x"), x) && within(number("y"), y), "around ({x}, {y}): {patch}");
+        assert!((0.0..=1.0).contains(&number("confidence")) && number("confidence") > 0.0 && number("expected_error") >= 0.0, "{patch}");
+        let extent = patch["psf"]["extent_px"].as_f64().unwrap();
+        assert!((3.0..12.0).contains(&extent), "a blur of 7 px: {extent} px");
+    }
+}
+
+/// The size of the PSFs follows the blur, unless it is given.
+#[test]
+fn psfs_are_as_large_as_the_blur_asks() {
+    let dir = tempdir().unwrap();
+    let radius = |extent: f64, more: &[&str]| {
+        tiny(dir.path(), [0.0, 0.0, extent], 0.4);
+        let name = format!("o{extent}{}", more.len());
+        let (_, _, report, _) = merge_tiny(dir.path(), &name, &[&["--prior", "tv"], more].concat());
+        let patches = report["frames"][2]["blur"]["patches"].as_array().unwrap().clone();
+        patches.iter().map(|p| p["psf"]["radius"].as_u64().unwrap()).max().unwrap()
+    };
+    let (short, long, given) = (radius(3.0, &[]), radius(12.0, &[]), radius(12.0, &["--psf-radius", "7"]));
+    println!("{short}, {long}, {given}");
+    assert!((2..=6).contains(&short), "3 px: {short}");
+    assert!((6..=18).contains(&long) && long > short + 2, "12 px: {long}, 3 px: {short}");
+    assert_eq!(given, 7);
+}
+
+/// Without `--focal-px` the focal length is the file's, of 36 mm along the longer side.
+#[test]
+fn the_focal_length_comes_from_exif() {
+    let dir = tempdir().unwrap();
+    tiny(dir.path(), [0.0, 0.0, 7.0], 0.4);
+    let first = dir.path().join("frame1.png");
+    let picture = image::open(&first).unwrap();
+    with_exif(&first, &picture, &[(exif::Tag::FocalLengthIn35mmFilm, exif::Value::Short(vec![75]))]);
+    let (_, _, report, _) = merge_tiny(dir.path(), "exif", &["--prior", "tv", "--model", "rotation"]);
+    let blur = &report["frames"][2]["blur"];
+    assert_eq!((&blur["focal_length"], &blur["focal_px"]), (&json!("given"), &json!(200.0)), "75 mm / 36 mm of 96 px: {blur}");
+}
+
+/// What both the sharp frames and the shaken one see clearly is flat: it is left out by name, and what would help is said.
+#[test]
+fn a_frame_of_too_little_texture_is_left_out_with_what_would_help() {
+    let dir = tempdir().unwrap();
+    let mut noise = Noise::new(4);
+    for (name, time) in [("frame1.png", 1.0 / 30.0), ("frame2.png", 1.0 / 8.0), ("frame3.png", 0.5)] {
+        let picture = image::RgbImage::from_fn(96, 72, |x, y| {
+            // Flat on the left; on the right tiles that the last frame clips.
+            let bright = if (x / 6 + y / 5) % 2 == 0 { 2.6 } else { 5.2 };
+            let e = if x < 56 { 0.5 } else { bright } * time + 0.003 * noise.normal();
+            image::Rgb([(e.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8; 3])
+        });
+        picture.save(dir.path().join(name)).unwrap();
+    }
+    let (_, _, report, said) = merge_tiny(dir.path(), "flat", &["--sharp", "1,2", "--no-align"]);
+    for words in ["frame3.png", "too little texture", "a sharp frame with a longer exposure time"] {
+        assert!(said.contains(words), "{said:?} lacks {words:?}");
+    }
+    assert_eq!(column(&report, "used"), [true, true, false], "{said}");
 }
 
 #[test]

@@ -313,6 +313,18 @@ fn a_displaced_frame_that_shows_to_be_sharp_helps_to_place_the_others() {
     assert_eq!(sharp, [true, true, false]);
 }
 
+/// Name of each frame, trace of the covariance of its blur's translations as it was found, and of the true one's, square pixels.
+fn spreads(found: &Outcome, truths: &[Tsf]) -> Vec<(String, f64, f64)> {
+    let spread = |t: &Tsf| t.covariance().col(0).x + t.covariance().col(1).y;
+    let of = |(frame, truth): (&serde_json::Value, &Tsf)| {
+        let entry: TsfEntry = serde_json::from_value(frame["tsf"].clone()).unwrap();
+        let (found, true_one) = (spread(&Tsf::new(entry.focal_px, entry.poses).unwrap()), spread(truth));
+        println!("{}: {found:.3} px^2 for {true_one:.3}", entry.frame);
+        (entry.frame, found, true_one)
+    };
+    found.report["frames"].as_array().unwrap().iter().zip(truths).map(of).collect()
+}
+
 /// Frames that pass for sharp and moved by two pixels, too little for a look at half the size: they are deblurred as well.
 #[test]
 fn a_slight_blur_of_all_frames_is_undone() {
@@ -355,12 +367,8 @@ fn a_slight_blur_of_large_frames_shows_in_a_part_of_them() {
     assert_eq!(blind["set_free"]["believed"], true, "{blind}");
     assert_eq!(blind["set_free"]["window_px"].as_array().map(Vec::len), Some(4), "{blind}");
     assert_eq!(found.degraded, Vec::<String>::new());
-    for (frame, truth) in found.report["frames"].as_array().unwrap().iter().zip(&made.tsfs) {
-        let entry: TsfEntry = serde_json::from_value(frame["tsf"].clone()).unwrap();
-        let spread = |t: &Tsf| t.covariance().col(0).x + t.covariance().col(1).y;
-        let (found, true_one) = (spread(&Tsf::new(entry.focal_px, entry.poses).unwrap()), spread(truth));
-        println!("{}: {found:.3} px^2 for {true_one:.3}", entry.frame);
-        assert!((0.4..2.5).contains(&(found / true_one)), "{}: {found:.3} px^2 for {true_one:.3}", entry.frame);
+    for (name, found, true_one) in spreads(&found, &made.tsfs) {
+        assert!((0.4..2.5).contains(&(found / true_one)), "{name}: {found:.3} px^2 for {true_one:.3}");
     }
 }
 
@@ -382,12 +390,8 @@ fn frames_shaken_behind_a_soft_lens_are_all_estimated_behind_it() {
     let [beside, all] = ["held_out_chi_squared", "held_out_chi_squared_of_all"].map(|key| set_free[key].as_f64().unwrap());
     assert!(all < 0.8 * beside, "{blind}");
     assert!((0.5..1.3).contains(&blind["lens_px"].as_f64().unwrap()), "a lens of one pixel: {blind}");
-    for (frame, truth) in found.report["frames"].as_array().unwrap().iter().zip(&made.tsfs) {
-        let entry: TsfEntry = serde_json::from_value(frame["tsf"].clone()).unwrap();
-        let spread = |t: &Tsf| t.covariance().col(0).x + t.covariance().col(1).y;
-        let (found, true_one) = (spread(&Tsf::new(entry.focal_px, entry.poses).unwrap()), spread(truth));
-        println!("{}: {found:.3} px^2 for {true_one:.3}", entry.frame);
-        assert!((found - true_one).abs() < 0.6, "{}: {found:.3} px^2 for {true_one:.3}, the lens has 2", entry.frame);
+    for (name, found, true_one) in spreads(&found, &made.tsfs) {
+        assert!((found - true_one).abs() < 0.6, "{name}: {found:.3} px^2 for {true_one:.3}, the lens has 2");
     }
 }
 

@@ -1,8 +1,7 @@
 //! Files: frames, exposure times, OpenEXR, outputs.
 
-use crate::support::files::{listing, shared};
-use image::{DynamicImage, ImageEncoder};
-use std::io::Cursor;
+use crate::support::files::{listing, shared, with_exif};
+use image::DynamicImage;
 use std::path::{Path, PathBuf};
 use tempfile::tempdir;
 use unshaken::image::{Plane, Rgb};
@@ -18,26 +17,6 @@ fn error_of(path: &Path) -> String {
 
 fn radiometry() -> Radiometry {
     Radiometry { exposure_time: 0.2, frame: "b.png".into() }
-}
-
-/// A JPEG or PNG with the EXIF fields given.
-fn with_exif(path: &Path, picture: &DynamicImage, fields: &[(exif::Tag, exif::Value)]) {
-    let fields: Vec<_> =
-        fields.iter().map(|(tag, value)| exif::Field { tag: *tag, ifd_num: exif::In::PRIMARY, value: value.clone() }).collect();
-    let mut writer = exif::experimental::Writer::new();
-    fields.iter().for_each(|f| writer.push_field(f));
-    let mut blob = Cursor::new(Vec::new());
-    writer.write(&mut blob, false).unwrap();
-    let file = std::fs::File::create(path).unwrap();
-    if path.extension().is_some_and(|e| e == "png") {
-        let mut encoder = image::codecs::png::PngEncoder::new(file);
-        encoder.set_exif_metadata(blob.into_inner()).unwrap();
-        picture.write_with_encoder(encoder).unwrap();
-    } else {
-        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 95);
-        encoder.set_exif_metadata(blob.into_inner()).unwrap();
-        picture.write_with_encoder(encoder).unwrap();
-    }
 }
 
 #[test]

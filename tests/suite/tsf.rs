@@ -228,13 +228,13 @@ fn a_stray_pose_is_part_of_the_extent_and_hardly_of_the_stroke() {
 }
 
 #[test]
-fn blur_of_three_and_of_fifty_pixels_is_found() {
-    let (size, pad) = ((224, 176), 40);
+fn blur_of_three_and_of_sixty_pixels_is_found() {
+    let (size, pad) = ((224, 176), 48);
     // Structure at all scales: a long blur leaves nothing of the finest.
     let fine = texture(size.0 + 2 * pad, size.1 + 2 * pad);
     let coarse = texture(40, 40);
     let latent = Plane::from_fn(fine.width, fine.height, |x, y| fine.at(x, y) + 2.0 * coarse.at(x / 8, y / 8));
-    for (extent, limit) in [(3.0, 0.06), (50.0, 0.06)] {
+    for (extent, limit) in [(3.0, 0.06), (60.0, 0.06)] {
         let truth = path(300.0, |t| Pose::planar(extent * t, 0.5 * extent * t * t, 0.3 * t, 1.0));
         let (blurred, weight) = shaken(&latent, pad, &truth, size);
         let frame = WholeFrame { latent: &latent, pad, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };

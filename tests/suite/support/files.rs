@@ -1,5 +1,7 @@
 //! Shared data, files and pictures that tests of files need.
 
+use image::{DynamicImage, ImageEncoder};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use unshaken::image::Plane;
 
@@ -29,6 +31,26 @@ pub fn listing(folder: &Path) -> Vec<String> {
 /// An 8-bit RGB PNG of `value(x, y)` in all channels.
 pub fn write_png(path: &Path, width: u32, height: u32, value: impl Fn(u32, u32) -> u8) {
     image::RgbImage::from_fn(width, height, |x, y| image::Rgb([value(x, y); 3])).save(path).unwrap();
+}
+
+/// A JPEG or PNG with the EXIF fields given.
+pub fn with_exif(path: &Path, picture: &DynamicImage, fields: &[(exif::Tag, exif::Value)]) {
+    let fields: Vec<_> =
+        fields.iter().map(|(tag, value)| exif::Field { tag: *tag, ifd_num: exif::In::PRIMARY, value: value.clone() }).collect();
+    let mut writer = exif::experimental::Writer::new();
+    fields.iter().for_each(|f| writer.push_field(f));
+    let mut blob = Cursor::new(Vec::new());
+    writer.write(&mut blob, false).unwrap();
+    let file = std::fs::File::create(path).unwrap();
+    if path.extension().is_some_and(|e| e == "png") {
+        let mut encoder = image::codecs::png::PngEncoder::new(file);
+        encoder.set_exif_metadata(blob.into_inner()).unwrap();
+        picture.write_with_encoder(encoder).unwrap();
+    } else {
+        let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 95);
+        encoder.set_exif_metadata(blob.into_inner()).unwrap();
+        picture.write_with_encoder(encoder).unwrap();
+    }
 }
 
 /// Uniform numbers in 0..1 from a fixed seed.
