@@ -54,11 +54,6 @@ impl Joint {
     pub fn if_held(&self, still: &[usize]) -> f64 {
         self.seen.if_still(still)
     }
-
-    /// Extent of each frame's blur in pixels, the lens's not counted.
-    pub fn extents(&self) -> Vec<f64> {
-        self.seen.extents()
-    }
 }
 
 /// What TSFs are fitted to.

@@ -559,9 +559,9 @@ impl Run<'_> {
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
         let starts = self.starts(used, channels);
-        let places = places(asked, used);
+        let asked_places = places(asked, used);
         let at_most = doubt.map_or(0.0, |doubt| doubt.most_growth(asked));
-        let doubted = Doubted { frames: &places, at_most };
+        let doubted = Doubted { frames: &asked_places, at_most };
         let doubtful = doubt.is_some();
         let why = if doubtful { "no frame is surely sharp" } else { "no frame is sharp" };
         let still: Vec<Tsf> = used.iter().map(|&i| Tsf::still(self.motions[i])).collect();
@@ -580,7 +580,7 @@ impl Run<'_> {
         let stood_still = !asked.is_empty() && doubt.is_some_and(|doubt| doubt.stands(found.if_still, asked));
         let all_moved = explained && (!doubtful || (moved.len() == used.len() && !stood_still));
         let in_question = doubt.filter(|_| all_moved && found.lens_px > 0.0).map(|doubt| &doubt.passing);
-        let held = in_question.map(|passing| stood_behind_lens(&found, &self::places(passing, used)));
+        let held = in_question.map(|passing| stood_behind_lens(&found, &places(passing, used)));
         let believed = all_moved && held.as_ref().is_none_or(|(stood, _)| stood.is_empty());
         self.blind = json!({
             "method": "joint",
@@ -590,7 +590,7 @@ impl Run<'_> {
             "channels": channels.names(),
             "extent_px": extents,
             "estimated_at_scale": found.scale,
-            "residual_if_still": (!places.is_empty()).then_some(found.if_still),
+            "residual_if_still": (!asked_places.is_empty()).then_some(found.if_still),
             "held_out_chi_squared": found.held_out,
             "held_out_chi_squared_of_merge": found.held_out_merge,
             "lens_px": found.lens_px,

@@ -167,18 +167,16 @@ impl Run<'_> {
     fn view(&self, used: &[usize], known: &[Tsf], latent: &Rgb, centre: usize) -> View {
         let channels = self.most_telling(used, used);
         let (frames, luminance) = (self.luminance_frames(used, channels), latent.mean_of(channels));
-        let window = if blind::fits(luminance.size()) { None } else { self.window(used, &frames, FREE_WINDOW) };
-        match window {
-            None => View { frames, luminance, known: known.to_vec(), centre, window, channels },
-            Some(window) => View {
-                frames: window.cut(&frames),
-                luminance: luminance.crop(window.at.0, window.at.1, window.size.0, window.size.1),
-                known: known.iter().enumerate().map(|(k, t)| window.seen(k, t)).collect(),
-                centre,
-                window: Some(window),
-                channels,
-            },
+        let mut view = View { frames, luminance, known: known.to_vec(), centre, window: None, channels };
+        if !blind::fits(view.luminance.size())
+            && let Some(window) = self.window(used, &view.frames, FREE_WINDOW)
+        {
+            view.frames = window.cut(&view.frames);
+            view.luminance = view.luminance.crop(window.at.0, window.at.1, window.size.0, window.size.1);
+            view.known = known.iter().enumerate().map(|(k, t)| window.seen(k, t)).collect();
+            view.window = Some(window);
         }
+        view
     }
 
     /// Which of the frames at the `places` among those `used` moved; `None` where nothing says that one did.
