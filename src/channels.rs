@@ -5,7 +5,7 @@ use crate::exposure::Frame;
 use crate::image::{Channels, Rgb};
 use crate::mask;
 use crate::merge::gradient_level;
-use crate::noise::NoiseModel;
+use crate::noise::FrameNoise;
 use rayon::prelude::*;
 
 /// Error of an operator as a part of the structure around a pixel: structure beyond its inverse, in units of the noise, tells no more.
@@ -32,11 +32,11 @@ fn known<'a>(frames: impl Iterator<Item = &'a Frame>, size: (usize, usize), chan
 
 /// What the mean of `channels` of an exposure (1 = white) tells about its blur: the sum over the pixels `seen` of squared gradients in units of the
 /// noise, as far as they count.
-fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: impl Fn(usize) -> bool + Sync) -> f64 {
+fn information(exposure: &Rgb, channels: Channels, noise: &FrameNoise, seen: impl Fn(usize) -> bool + Sync) -> f64 {
     let mean = exposure.mean_of(channels);
     let structure = gradient_level(&mean, AROUND);
     let one = |p: usize| {
-        let variance = noise.variance(f64::from(mean.data[p])) / channels.count() as f64;
+        let variance = noise.variance_of_mean(channels, f64::from(mean.data[p]));
         let signal = (f64::from(structure.data[p]).powi(2) - NOISE_GRADIENT * variance).max(0.0);
         signal / (variance + MODEL_ERROR.powi(2) * signal)
     };
@@ -46,7 +46,7 @@ fn information(exposure: &Rgb, channels: Channels, noise: &NoiseModel, seen: imp
 
 /// The channels whose mean tells most about the blurs of the frames `blurred` (no frame's is bought with another's), the scene being known from
 /// the frames `by`: indices into `frames`, whose exposures (1 = white) are `exposures`. All three channels where they clip together.
-pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: &[usize], noise: &NoiseModel) -> Channels {
+pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: &[usize], noise: &[FrameNoise]) -> Channels {
     let gain = if blurred.iter().chain(by).any(|&i| frames[i].chroma_subsampled) { SUBSAMPLED_GAIN } else { GAIN };
     let clipped = |c: Channels| -> Vec<Vec<bool>> { blurred.iter().map(|&i| mask::clipped(&frames[i], c)).collect() };
     let recorded = |clipped: &[Vec<bool>]| clipped.iter().flatten().filter(|c| !**c).count();
@@ -59,7 +59,7 @@ pub fn most_telling(frames: &[Frame], exposures: &[Rgb], blurred: &[usize], by: 
     }
     let told = |channels: Channels, clipped: &[Vec<bool>]| {
         let known = known(by.iter().map(|&k| &frames[k]), frames[0].intensity.size(), channels);
-        let of = |(&i, clipped): (&usize, &Vec<bool>)| information(&exposures[i], channels, noise, |p| known[p] && !clipped[p]);
+        let of = |(&i, clipped): (&usize, &Vec<bool>)| information(&exposures[i], channels, &noise[i], |p| known[p] && !clipped[p]);
         blurred.iter().zip(clipped).map(|b| (1.0 + of(b)).ln()).sum::<f64>()
     };
     let mut best = (told(Channels::ALL, &all) + blurred.len() as f64 * gain.ln(), Channels::ALL);

@@ -83,6 +83,12 @@ impl Bracket {
         Ok(Self { frames })
     }
 
+    /// The same frames at other exposure times, in seconds, as many as there are frames.
+    #[must_use]
+    pub fn with_exposure_times(&self, times: impl Iterator<Item = f64>) -> Self {
+        Self { frames: self.frames.iter().zip(times).map(|(f, exposure_time)| Frame { exposure_time, ..f.clone() }).collect() }
+    }
+
     /// The frames in command-line order.
     pub fn frames(&self) -> &[Frame] {
         &self.frames

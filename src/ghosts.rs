@@ -6,7 +6,7 @@
 use crate::exposure::Frame;
 use crate::image::{Plane, Rgb};
 use crate::mask;
-use crate::noise::{self, NoiseModel};
+use crate::noise::{self, FrameNoise};
 use crate::pose::project;
 use crate::sampling::bilinear;
 use glam::{DMat3, DVec2};
@@ -61,7 +61,7 @@ pub struct Sharp<'a> {
     /// Their noise, as [`noise::curves`] has it, and without what rounding adds.
     pub curves: &'a [[Vec<f32>; 3]],
     /// Likewise.
-    pub noise: &'a NoiseModel,
+    pub noise: &'a [FrameNoise],
     /// Each frame's place, from the reference, centred pixels.
     pub motions: &'a [DMat3],
     /// The sharp ones.
@@ -150,7 +150,7 @@ impl Sharp<'_> {
         // Frames of 8 bits that were reduced have finer steps, but what their file dropped did not come back.
         let coarser = if frame.levels % 255 == 0 && frame.levels < 65535 { frame.levels as f32 / 255.0 } else { 1.0 };
         let relative = |c: usize, x: f32| {
-            let (all, captured) = (noise::at(&self.curves[i][c], x).powi(2), self.noise.variance(f64::from(x)) as f32);
+            let (all, captured) = (noise::at(&self.curves[i][c], x).powi(2), self.noise[i].channels[c].variance(f64::from(x)) as f32);
             // Rounding makes a twelfth of a step's square.
             let rounding = 12.0 * (all - captured).max(0.0) * STEPS * STEPS * coarser * coarser;
             (captured / averaged + rounding) / (x * x).max(f32::MIN_POSITIVE)

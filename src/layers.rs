@@ -3,7 +3,6 @@
 use crate::exposure::Bracket;
 use crate::image::Plane;
 use crate::mask::CLIPPED;
-use crate::noise::NoiseModel;
 use crate::pipeline::Outcome;
 use crate::pose::nearest_pixel;
 use crate::response::Response;
@@ -25,8 +24,6 @@ pub struct Grounds {
 pub fn grounds(bracket: &Bracket, response: &Response, outcome: &Outcome) -> Grounds {
     let frames = bracket.frames();
     let (width, height) = bracket.size();
-    let noise: NoiseModel =
-        serde_json::from_value(outcome.report["noise"].clone()).unwrap_or_else(|_| NoiseModel::from_electrons(10_000.0, 5.0));
     let used: Vec<usize> = (0..frames.len()).filter(|&i| outcome.misfit[i].is_some()).collect();
     let scale = frames[outcome.reference].exposure_time;
     let result = &outcome.irradiance.0[1].data;
@@ -36,7 +33,7 @@ pub fn grounds(bracket: &Bracket, response: &Response, outcome: &Outcome) -> Gro
         .map(|&i| {
             // From the result's unit to the frame's exposure.
             let gain = frames[i].exposure_time / scale;
-            let curve = noise.curve(response, 1, frames[i].levels);
+            let curve = outcome.noise[i].channels[1].curve(response, 1, frames[i].levels);
             let last = (curve.len() - 1) as f64;
             let data = (0..width * height)
                 .into_par_iter()

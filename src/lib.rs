@@ -5,7 +5,7 @@
 //!
 //! 1. [`response`]: irradiance B = f⁻¹(Z)/Δt of each frame from its intensity Z and exposure time Δt (section II-A).
 //! 2. [`mask`] and [`noise`]: which pixels count (Tukey window, eq. 8) and how much (inverse variance).
-//! 3. [`triage`]: which frames are sharp.
+//! 3. [`register`] and [`photometry`]: where each frame lies, its gain and its black level; [`pipeline`] judges which are stationary.
 //! 4. [`psf`]: patches of each blurred frame and their local PSFs h against the sharp reference (eq. 11).
 //! 5. [`tsf`]: the transformation spread function h_T over poses Γ (eq. 2-6) from the PSFs, refined on the whole frame.
 //!    When no frame is sharp, [`blind`] finds the TSFs of all frames and the scene together instead (section III-B).
@@ -36,6 +36,7 @@ pub mod merge;
 pub mod metrics;
 pub mod noise;
 mod nonnegative;
+pub mod photometry;
 pub mod pipeline;
 pub mod pose;
 #[cfg(feature = "preview")]
@@ -47,5 +48,4 @@ pub mod response;
 mod sampling;
 pub mod synth;
 pub mod tonemap;
-pub mod triage;
 pub mod tsf;

@@ -1,16 +1,16 @@
-//! Noise of an exposure x = f⁻¹(Z) (1 = white): variance = shot · x + read + (slope of f⁻¹ · step)²/12, and its level
-//! estimated from the frames.
+//! Noise of an exposure x = f⁻¹(Z) (1 = white), estimated from each frame by itself: variance = shot · x + read + (slope of f⁻¹ · step)²/12.
+//!
+//! What counts for everything that averages pixels is the noise *density*: the variance of a mean of n pixels times n. A demosaiced pixel shares its noise with
+//! its neighbours, and a camera's engine smooths it further; the density stays what the sensor made it, while the variance of differences between
+//! neighbours falls to a tenth (green of a converter's file), to a three hundredth (JPEG). So the density is measured on means of squares of [`COARSE`]
+//! pixels as well as on pixels.
 
 use crate::exposure::Frame;
-use crate::image::{Plane, Rgb};
+use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::NOISE_STEPS;
 use crate::response::Response;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-
-mod squares;
-
-pub use squares::of_squares;
 
 /// Shot and read noise of a camera at one sensitivity, in units of the exposure (1 = white).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,6 +25,12 @@ impl NoiseModel {
     /// The model of a sensor with this full well and read noise, both in electrons.
     pub fn from_electrons(full_well: f64, read_noise: f64) -> Self {
         Self { shot: 1.0 / full_well, read: (read_noise / full_well).powi(2) }
+    }
+
+    /// About how much the mean of exposures `x` rises where their noise is clipped at black (an upper bound: 0.40 σ at 0, 0.15 σ at one σ, where it is 0.08).
+    pub fn clipping_bias(&self, x: f64) -> f64 {
+        let deviation = self.variance(x).sqrt();
+        0.4 * deviation * (-x.max(0.0) / deviation.max(f64::MIN_POSITIVE)).exp()
     }
 
     /// Variance of the exposure `x` without quantisation.
@@ -45,9 +51,88 @@ impl NoiseModel {
     }
 }
 
-/// [`NoiseModel::curve`] of each frame's channels.
-pub fn curves(frames: &[Frame], response: &Response, model: &NoiseModel) -> Vec<[Vec<f32>; 3]> {
-    frames.iter().map(|f| std::array::from_fn(|c| model.curve(response, c, f.levels))).collect()
+/// Noise of one frame.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrameNoise {
+    /// Of red, green and blue: the density, as the variance that a pixel of white noise would have.
+    pub channels: [NoiseModel; 3],
+    /// The same of the mean of the three.
+    pub luminance: NoiseModel,
+    /// The luminance's density over what its finest structure shows of it: 1 where the noise is white.
+    pub correlation: f64,
+}
+
+impl FrameNoise {
+    /// White noise, alike in all channels.
+    pub fn white(model: NoiseModel) -> Self {
+        let luminance = NoiseModel { shot: model.shot / 3.0, read: model.read / 3.0 };
+        Self { channels: [model; 3], luminance, correlation: 1.0 }
+    }
+
+    /// That of the exposures times `factors`, one per channel.
+    #[must_use]
+    pub fn scaled(&self, factors: [f64; 3]) -> Self {
+        let scaled = |NoiseModel { shot, read }: NoiseModel, s: f64| NoiseModel { shot: s * shot, read: s * s * read };
+        Self {
+            channels: std::array::from_fn(|c| scaled(self.channels[c], factors[c])),
+            luminance: scaled(self.luminance, factors.iter().sum::<f64>() / 3.0),
+            ..*self
+        }
+    }
+
+    /// Part of the density that differences over `scale` pixels of means of `scale` × `scale` pixels show. White noise behind a Gaussian whose standard deviation makes the
+    /// finest second differences show a part 1/c of the density shows c^-0.60, c^-0.255 and c^-0.112 of it at 1, 2 and 4 pixels (c from 3 to 2000, computed from the
+    /// spectra, within a tenth).
+    pub fn share(&self, scale: usize) -> f64 {
+        let power = match scale {
+            1 => -0.60,
+            2 | 3 => -0.255,
+            _ => -0.112,
+        };
+        self.correlation.powf(power)
+    }
+
+    /// Noise as structure of about two pixels shows it: what registration and searches for blur look at.
+    #[must_use]
+    pub fn of_detail(&self) -> Self {
+        let share = self.share(2);
+        let less = |NoiseModel { shot, read }: NoiseModel| NoiseModel { shot: share * shot, read: share * read };
+        Self { channels: self.channels.map(less), luminance: less(self.luminance), correlation: 1.0 }
+    }
+
+    /// Variance of the mean of `channels`, each of which has the exposure `x`, without quantisation.
+    pub fn variance_of_mean(&self, channels: Channels, x: f64) -> f64 {
+        if channels == Channels::ALL {
+            return self.luminance.variance(x);
+        }
+        let n = channels.count() as f64;
+        channels.indices().map(|c| self.channels[c].variance(x)).sum::<f64>() / (n * n)
+    }
+}
+
+/// `model` as the white noise of so many frames.
+pub fn alike(frames: usize, model: NoiseModel) -> Vec<FrameNoise> {
+    vec![FrameNoise::white(model); frames]
+}
+
+/// Standard deviation of the exposures of each frame's channels, see [`NoiseModel::curve`]; `gains`: what the exposures were multiplied by.
+pub fn curves_of(frames: &[Frame], response: &Response, noise: &[FrameNoise], gains: &[[f64; 3]]) -> Vec<[Vec<f32>; 3]> {
+    let one = |(f, (n, gain)): (&Frame, (&FrameNoise, &[f64; 3]))| {
+        std::array::from_fn(|c| {
+            let quantum = quantisation(response, c, f.levels);
+            let at = |i: usize| {
+                let x = (i as f64 / (NOISE_STEPS - 1) as f64).powi(2);
+                (n.channels[c].variance(x) + gain[c] * gain[c] * quantum(x / gain[c])).sqrt() as f32
+            };
+            (0..NOISE_STEPS).map(at).collect()
+        })
+    };
+    frames.iter().zip(noise.iter().zip(gains)).map(one).collect()
+}
+
+/// [`curves_of`] exposures as they are.
+pub fn curves(frames: &[Frame], response: &Response, noise: &[FrameNoise]) -> Vec<[Vec<f32>; 3]> {
+    curves_of(frames, response, noise, &vec![[1.0; 3]; frames.len()])
 }
 
 /// What a [`NoiseModel::curve`] says at the exposure `x`: the sample below.
@@ -55,9 +140,15 @@ pub fn at(curve: &[f32], x: f32) -> f32 {
     curve[((x.clamp(0.0, 1.0).sqrt() * (NOISE_STEPS - 1) as f32) as usize).min(NOISE_STEPS - 1)]
 }
 
-/// Curve of the variance of the mean of a frame's channels, where all three have the same exposure.
+/// Curve of the variance of the mean of `channels`, where all have the same exposure.
+pub fn of_mean_of(curves: &[Vec<f32>; 3], channels: Channels) -> Vec<f32> {
+    let n = channels.count() as f32;
+    (0..NOISE_STEPS).map(|i| channels.indices().map(|c| curves[c][i] * curves[c][i]).sum::<f32>() / (n * n)).collect()
+}
+
+/// [`of_mean_of`] all channels.
 pub fn of_mean(curves: &[Vec<f32>; 3]) -> Vec<f32> {
-    (0..NOISE_STEPS).map(|i| curves.iter().map(|c| c[i] * c[i]).sum::<f32>() / 9.0).collect()
+    of_mean_of(curves, Channels::ALL)
 }
 
 /// Variance of the exposure that rounding to `levels` steps of intensity adds, as a function of the exposure.
@@ -72,17 +163,6 @@ fn quantisation(response: &Response, channel: usize, levels: u32) -> impl Fn(f64
     }
 }
 
-/// Variance by `quantum` of a frame at `exposure`, or of it less `ratio` times a longer one that shows the same.
-fn rounding(quantum: &impl Fn(f64) -> f64, exposure: f64, ratio: f64) -> f64 {
-    quantum(exposure) + if ratio > 0.0 { ratio * ratio * quantum(exposure / ratio) } else { 0.0 }
-}
-
-/// The frames `ids`, each with the next longer one.
-fn pairs(frames: &[Frame], mut ids: Vec<usize>) -> Vec<(usize, usize)> {
-    ids.sort_by(|&i, &j| frames[i].exposure_time.total_cmp(&frames[j].exposure_time));
-    ids.windows(2).map(|p| (p[0], p[1])).collect()
-}
-
 /// Exposures f⁻¹(Z) of a frame.
 pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
     // Few distinct intensities: one table instead of a power per pixel.
@@ -93,183 +173,190 @@ pub fn exposure(frame: &Frame, response: &Response) -> Rgb {
     }))
 }
 
-/// Side of the blocks whose variance is measured, pixels.
+/// Whether an intensity is not, for certain, clipped in white.
+fn is_clear(z: f32) -> bool {
+    z < 0.95
+}
+
+/// Part of a block's pixels that may read 0: noise clipped at black has lost little of its variance up to there, and a frame so noisy that every block holds some has no other.
+const BLACK: f64 = 0.2;
+
+/// Side of the blocks whose variance is measured: pixels, and means of squares of [`COARSE`] pixels.
 const BLOCK: usize = 8;
+const COARSE_BLOCK: usize = 3;
+/// Side in pixels of the squares whose means show the density of correlated noise: demosaicing and engines reach over about four pixels. On 24 random cameras
+/// the density of green comes out right in the median (a quarter of it to three times), at a side of 2 ten times too low.
+const COARSE: usize = 4;
+/// Ratio of the two densities up to which noise counts as white: texture lifts the coarse one by up to that; demosaiced noise has ten.
+const WHITE: f64 = 4.0;
 /// Blocks of one channel that are enough to tell the noise by, about.
 const ENOUGH: usize = 60_000;
-/// Quantile of variances that is taken for noise alone.
-struct Quantile {
-    at: f64,
-    /// That quantile of noise over its expectation.
-    of_noise: f64,
-}
+/// Quantile of blocks that is taken for noise alone, as texture only ever adds.
+const FLATTEST: f64 = 0.05;
+/// That quantile of the mean square of so many squared samples of filtered white noise over its expectation (10⁶ simulated blocks).
+const OF_NOISE: [(usize, f64); 2] = [(BLOCK, 0.555), (COARSE_BLOCK, 0.214)];
+/// Most that correlation is believed to be: beyond, the finest structure is what compression left of it.
+const MOST_CORRELATED: f64 = 1000.0;
+/// Blocks that a bin has at least.
+const FEWEST: usize = 30;
+/// Least variance at black as a part of that of the darkest blocks: nothing darker is free of clipping at black, so that a line through the samples may end
+/// anywhere below.
+const AT_BLACK: f64 = 0.2;
+/// Most that the variance at black may be, times the shot noise's at white: read noise of 9 electrons beside a full well of 270. What the darkest blocks show beyond is texture.
+const MOST_AT_BLACK: f64 = 0.3;
+/// Least read noise, electrons, the full well being one over the shot noise's variance: where every dark block is clipped at black the samples do not show it.
+const LEAST_READ: f64 = 2.0;
+/// What is assumed where no block is usable: full well and read noise of a small sensor at a middle speed, electrons.
+const ASSUMED: (f64, f64) = (2000.0, 5.0);
 
-/// That of the variances of blocks, as texture only ever adds; for the mean square of 64 samples of filtered white noise (2·10⁴ simulated blocks).
-const FLATTEST: Quantile = Quantile { at: 0.05, of_noise: 0.554 };
-
-/// Noise level of a bracket's frames, from the high-pass variance of their flattest blocks at each exposure and of the flattest blocks of
-/// the differences between each frame and the next longer one.
+/// Noise of each of `frames`, from the high-pass variance of its own flattest blocks at each exposure.
 ///
-/// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes; blocks of all frames and
-/// channels are pooled, since shot and read noise depend on the exposure alone; blurred frames contribute most, as blur
-/// removes texture but not noise. Where two frames show the same scene in the same place, their difference has no texture left; where they
-/// do not, it has more, and texture never lowers a variance. Samples that others at a like exposure undercut are left out, where
-/// no file format may have smoothed these: where bright parts are all texture and dark ones black, few blocks tell the noise. Falls back to a full well
-/// of 10 000 e⁻ and read noise of 5 e⁻ when no block is usable.
-pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> NoiseModel {
-    let at_lag = |lag| {
-        let samples = samples(frames, exposures, response, lag);
-        let many: Vec<Sample> = samples.iter().filter(|s| s.blocks >= MANY as f64).copied().collect();
-        fit(&many, BELOW).map(|model| (samples, model))
-    };
-    match (at_lag(1), at_lag(COARSE_LAG)) {
-        // White noise reads the same at both lags, texture only lifts the coarse one a little.
-        (Some((_, fine)), Some((_, coarse))) if MID_EXPOSURES.iter().all(|&x| coarse.variance(x) > CORRELATED * fine.variance(x)) => coarse,
-        (Some((samples, fine)), _) if !frames.iter().any(|f| f.lossy) => fit(&untextured(&samples, &fine), BELOW).unwrap_or(fine),
-        (Some((_, fine)), _) => fine,
-        (None, Some((_, coarse))) => coarse,
-        (None, None) => NoiseModel::from_electrons(10_000.0, 5.0),
-    }
+/// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes. It is taken of pixels and of means of [`COARSE`]² pixels; where
+/// the second shows a density more than [`WHITE`] times that of the first in three quarters of the exposures, neighbours share their noise. Red and blue
+/// sites are half as many as green ones and their gain is higher: where noise is correlated their density is at least green's, as chroma
+/// is smoothed over more pixels than a square has.
+pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> Vec<FrameNoise> {
+    frames.par_iter().zip(exposures).map(|(f, x)| of_frame(f, x, response)).collect()
 }
 
-/// Distance in pixels of the taps of the second high-pass, for noise that a file format has made smooth.
-const COARSE_LAG: usize = 3;
-/// Ratio of the two variances from which the noise counts as smoothed (JPEG drops the finest structure).
-const CORRELATED: f64 = 2.5;
-/// Exposures at which they are compared.
-const MID_EXPOSURES: [f64; 2] = [0.02, 0.2];
+fn of_frame(frame: &Frame, exposure: &Rgb, response: &Response) -> FrameNoise {
+    let planes = &frame.intensity.0;
+    let all = |test: &(dyn Fn(f32) -> bool + Sync), c: std::ops::Range<usize>| -> Vec<bool> {
+        (0..planes[0].data.len()).into_par_iter().map(|p| c.clone().all(|c| test(planes[c].data[p]))).collect()
+    };
+    let counts = |c: std::ops::Range<usize>| Counts { clear: all(&is_clear, c.clone()), black: all(&|z| z <= 0.0, c) };
+    let own: [Counts; 3] = std::array::from_fn(|c| counts(c..c + 1));
+    let of_all = counts(0..3);
+    let quantum: [_; 3] = std::array::from_fn(|c| quantisation(response, c, frame.levels));
+    let of_channel = |c: usize, side: usize, block: usize| samples(&exposure.0[c], &own[c], side, block, &quantum[c]);
+    let mean = exposure.mean();
+    // Rounding is independent in the channels.
+    let rounding = |x: f64| quantum.iter().map(|q| q(x)).sum::<f64>() / 9.0;
+    let of_mean = |side: usize, block: usize| samples(&mean, &of_all, side, block, &rounding);
+    let model = |s: &[Sample]| fit(s, BELOW).map(|m| floored(m, s));
+    let assumed = NoiseModel::from_electrons(ASSUMED.0, ASSUMED.1);
+    let [fine, coarse] = [of_mean(1, BLOCK), of_mean(COARSE, COARSE_BLOCK)].map(|s| (model(&s), s));
+    let lower_quartile = |mut v: Vec<f64>| {
+        v.sort_by(f64::total_cmp);
+        v.get(v.len() / 4).copied()
+    };
+    let over =
+        |m: &Option<NoiseModel>| m.and_then(|m| lower_quartile(coarse.1.iter().map(|s| s.variance / m.variance(s.exposure)).collect()));
+    let correlation = over(&fine.0).unwrap_or(1.0);
+    if correlation < WHITE {
+        let white: [Option<NoiseModel>; 3] = std::array::from_fn(|c| model(&of_channel(c, 1, BLOCK)));
+        let any = white.iter().flatten().next().copied().unwrap_or(assumed);
+        let channels = white.map(|w| w.unwrap_or(any));
+        let third = NoiseModel { shot: any.shot / 3.0, read: any.read / 3.0 };
+        return FrameNoise { channels, luminance: fine.0.unwrap_or(third), correlation: 1.0 };
+    }
+    let luminance = coarse.0.unwrap_or(assumed);
+    let density: [Option<NoiseModel>; 3] = std::array::from_fn(|c| model(&of_channel(c, COARSE, COARSE_BLOCK)));
+    let green = density[1].or(density[0]).or(density[2]).unwrap_or(luminance);
+    let channels = density.map(|d| d.map_or(green, |d| NoiseModel { shot: d.shot.max(green.shot), read: d.read.max(green.read) }));
+    FrameNoise { channels, luminance, correlation: correlation.min(MOST_CORRELATED) }
+}
 
-/// Variance of what was looked at, and what the noise model says of it: `variance = shot · shots + read · reads`.
+/// Which pixels are clear of white, and which read 0.
+struct Counts {
+    clear: Vec<bool>,
+    black: Vec<bool>,
+}
+
+/// Samples of means of squares of `side` pixels of `x`, by blocks of `block` such squares.
+fn samples(x: &Plane, counts: &Counts, side: usize, block: usize, quantum: &(impl Fn(f64) -> f64 + Sync)) -> Vec<Sample> {
+    let (x, counts) = reduced(x, counts, side);
+    let of_noise = OF_NOISE.iter().find(|o| o.0 == block).expect("a block that was simulated").1;
+    bins(collect_blocks(&x, &counts, block, side, quantum), of_noise)
+}
+
+/// `model` with a variance at black that is not far below that of the darkest of `samples`.
+fn floored(model: NoiseModel, samples: &[Sample]) -> NoiseModel {
+    let darkest = samples.iter().min_by(|a, b| a.exposure.total_cmp(&b.exposure)).map_or(0.0, |s| s.variance);
+    let least = (LEAST_READ * model.shot).powi(2);
+    NoiseModel { read: model.read.max(AT_BLACK * darkest).min(MOST_AT_BLACK * model.shot).max(least), ..model }
+}
+
+/// Variance at an exposure.
 #[derive(Clone, Copy)]
 struct Sample {
     exposure: f64,
-    shots: f64,
-    reads: f64,
     variance: f64,
     blocks: f64,
 }
 
-impl Sample {
-    /// One block at `exposure` of a frame, or of a frame less `ratio` times a longer one; 0 where it is the frame alone.
-    fn new(exposure: f64, ratio: f64, variance: f64) -> Self {
-        // The longer frame has 1/ratio times the exposure, and its variance counts ratio² times.
-        Self { exposure, shots: exposure * (1.0 + ratio), reads: 1.0 + ratio * ratio, variance, blocks: 1.0 }
-    }
-
-    /// What `model` says of the variance.
-    fn of(&self, model: &NoiseModel) -> f64 {
-        model.shot * self.shots + model.read * self.reads
-    }
-}
-
-/// One channel of a frame, or of a frame less `ratio` times the next longer one.
-struct Source<'a> {
-    intensity: &'a Plane,
-    exposure: &'a Plane,
-    less: Option<(&'a Plane, &'a Plane, f64)>,
-}
-
-/// Samples of all frames and of all differences.
-fn samples(frames: &[Frame], exposures: &[Rgb], response: &Response, lag: usize) -> Vec<Sample> {
-    let source = |i: usize, c: usize| Source { intensity: &frames[i].intensity.0[c], exposure: &exposures[i].0[c], less: None };
-    let each = |i: usize| {
-        let blocks =
-            (0..3).into_par_iter().flat_map_iter(|c| collect_blocks(&source(i, c), lag, &quantisation(response, c, frames[i].levels)));
-        blocks.collect::<Vec<Sample>>()
+/// Means of squares of `side` pixels of `x`, whether all pixels of each are clear of white, and what part of them reads 0.
+fn reduced(x: &Plane, counts: &Counts, side: usize) -> (Plane, Vec<(bool, f32)>) {
+    let (w, h) = (x.width / side, x.height / side);
+    let n = (side * side) as f32;
+    let within = |p: usize| {
+        let (i, j) = (p % w * side, p / w * side);
+        (j..j + side).flat_map(move |j| (i..i + side).map(move |i| j * x.width + i))
     };
-    let of_frames = bins((0..frames.len()).flat_map(each).collect(), &FLATTEST, FEWEST);
-    let of_differences = pairs(frames, (0..frames.len()).collect()).into_iter().flat_map(|(i, j)| {
-        let ratio = frames[i].exposure_time / frames[j].exposure_time;
-        let differences = (0..3).into_par_iter().flat_map_iter(|c| {
-            let less = Some((&frames[j].intensity.0[c], &exposures[j].0[c], ratio));
-            let levels = frames[i].levels.min(frames[j].levels);
-            collect_blocks(&Source { less, ..source(i, c) }, lag, &quantisation(response, c, levels))
-        });
-        bins(differences.collect(), &FLATTEST, FEWEST)
-    });
-    of_frames.into_iter().chain(of_differences).collect()
+    let of = |p: usize| (within(p).all(|q| counts.clear[q]), within(p).filter(|&q| counts.black[q]).count() as f32 / n);
+    let counts = (0..w * h).into_par_iter().map(of).collect();
+    let means = if side == 1 { x.clone() } else { Plane::from_fn(w, h, |i, j| within(j * w + i).map(|q| x.data[q]).sum::<f32>() / n) };
+    (means, counts)
 }
 
-/// Exposures up to this factor apart count as alike.
-const ALIKE: f64 = 1.5;
-/// A sample shows texture where another has less than this part of its variance, both relative to the noise model.
-const UNDERCUT: f64 = 0.75;
-
-/// The samples that no other at a like exposure undercuts.
-fn untextured(samples: &[Sample], model: &NoiseModel) -> Vec<Sample> {
-    let relative: Vec<(f64, f64)> = samples.iter().map(|s| (s.exposure, s.variance / s.of(model))).collect();
-    let undercut = |&(x, v): &(f64, f64)| relative.iter().any(|&(y, u)| (x / y).max(y / x) < ALIKE && u < UNDERCUT * v);
-    samples.iter().zip(&relative).filter(|(_, r)| !undercut(r)).map(|(s, _)| *s).collect()
-}
-
-/// Blocks that a bin has at least, for a level by itself and for one that is known roughly.
-const MANY: usize = 60;
-const FEWEST: usize = 30;
-
-/// Quantiles of bins of equal population along the exposure, of at least `fewest` blocks, none wider than a factor of 1.5.
-fn bins(mut blocks: Vec<Sample>, quantile: &Quantile, fewest: usize) -> Vec<Sample> {
+/// Quantiles of bins along the exposure: as wide as a factor of 1.5, wider where that holds fewer than [`FEWEST`] blocks, of some hundred blocks at most. Within a bin
+/// variances are compared as those of shot noise, which grow with the exposure.
+fn bins(mut blocks: Vec<Sample>, of_noise: f64) -> Vec<Sample> {
+    blocks.retain(|b| b.exposure > 0.0);
     blocks.sort_by(|a, b| a.exposure.total_cmp(&b.exposure));
     let mut samples = Vec::new();
     let mut i = 0;
-    while i < blocks.len() {
+    while i + FEWEST <= blocks.len() {
         let end = blocks[i..].partition_point(|b| b.exposure <= 1.5 * blocks[i].exposure) + i;
-        let end = end.min(i + (blocks.len() / 40).max(200));
-        if end - i >= fewest {
-            let part = &blocks[i..end];
-            let mut v: Vec<f64> = part.iter().map(|b| b.variance).collect();
-            v.sort_by(f64::total_cmp);
-            let mean = |f: fn(&Sample) -> f64| part.iter().map(f).sum::<f64>() / part.len() as f64;
-            let variance = v[(quantile.at * v.len() as f64) as usize] / quantile.of_noise;
-            if variance > 0.0 {
-                let (exposure, shots, reads) = (mean(|b| b.exposure), mean(|b| b.shots), mean(|b| b.reads));
-                samples.push(Sample { exposure, shots, reads, variance, blocks: part.len() as f64 });
-            }
+        let mut end = end.max(i + FEWEST).min(i + (blocks.len() / 40).max(200));
+        if blocks.len() - end < FEWEST {
+            end = blocks.len();
+        }
+        let part = &blocks[i..end];
+        let exposure = part.iter().map(|b| b.exposure).sum::<f64>() / part.len() as f64;
+        let mut v: Vec<f64> = part.iter().map(|b| b.variance * exposure / b.exposure).collect();
+        v.sort_by(f64::total_cmp);
+        let variance = v[(FLATTEST * v.len() as f64) as usize] / of_noise;
+        if variance > 0.0 {
+            samples.push(Sample { exposure, variance, blocks: part.len() as f64 });
         }
         i = end;
     }
     samples
 }
 
-/// Whether a pixel is clipped neither in black nor, for certain, in white.
-fn clear(intensity: &Plane, i: usize, j: usize) -> bool {
-    intensity.at(i, j) > 0.0 && intensity.at(i, j) < 0.95
-}
-
-/// High-pass variance of the blocks that no clipping touches, of [`ENOUGH`] that are spread over the frame where it has more.
-fn collect_blocks(source: &Source, lag: usize, quantum: &(impl Fn(f64) -> f64 + Sync)) -> Vec<Sample> {
-    let (w, h) = source.exposure.size();
-    let step = BLOCK * (w * h / (BLOCK * BLOCK)).div_ceil(ENOUGH).isqrt().max(1);
+/// High-pass variance, as a density, of the blocks that no clipping touches, of [`ENOUGH`] that are spread over the frame where it has more. `side`: pixels along
+/// the sides of the squares that `x` has the means of.
+fn collect_blocks(x: &Plane, counts: &[(bool, f32)], block: usize, side: usize, quantum: &(impl Fn(f64) -> f64 + Sync)) -> Vec<Sample> {
+    let (w, h) = x.size();
+    let step = block * (w * h / (block * block)).div_ceil(ENOUGH).isqrt().max(1);
+    let area = (side * side) as f64;
     let row = |by: usize| {
         let mut blocks = Vec::new();
-        for bx in (lag..w.saturating_sub(BLOCK + lag - 1)).step_by(step) {
-            let mut around = (by - lag..by + BLOCK + lag).flat_map(|j| (bx - lag..bx + BLOCK + lag).map(move |i| (i, j)));
-            let usable = |(i, j): (usize, usize)| clear(source.intensity, i, j) && source.less.is_none_or(|l| clear(l.0, i, j));
-            if !around.all(usable) {
+        for bx in (1..w.saturating_sub(block)).step_by(step) {
+            let around = || (by - 1..=by + block).flat_map(|j| (bx - 1..=bx + block).map(move |i| counts[j * w + i]));
+            let black = around().map(|c| f64::from(c.1)).sum::<f64>() / ((block + 2) * (block + 2)) as f64;
+            if black > BLACK || !around().all(|c| c.0) {
                 continue;
             }
-            let value = |x: usize, y: usize| {
-                let own = f64::from(source.exposure.at(x, y));
-                source.less.map_or(own, |(_, longer, ratio)| own - ratio * f64::from(longer.at(x, y)))
-            };
             let (mut sum, mut square) = (0.0, 0.0);
-            for j in by..by + BLOCK {
-                for i in bx..bx + BLOCK {
-                    let at = |dx: usize, dy: usize| value(i + dx * lag - lag, j + dy * lag - lag);
+            for j in by..by + block {
+                for i in bx..bx + block {
+                    let at = |dx: usize, dy: usize| f64::from(x.at(i + dx - 1, j + dy - 1));
                     let corners = at(0, 0) + at(2, 0) + at(0, 2) + at(2, 2);
                     let sides = at(1, 0) + at(0, 1) + at(2, 1) + at(1, 2);
                     square += (corners - 2.0 * sides + 4.0 * at(1, 1)).powi(2) / 36.0;
-                    sum += f64::from(source.exposure.at(i, j));
+                    sum += at(1, 1);
                 }
             }
-            let n = (BLOCK * BLOCK) as f64;
-            let (exposure, square) = (sum / n, square / n);
-            let ratio = source.less.map_or(0.0, |l| l.2);
-            blocks.push(Sample::new(exposure, ratio, (square - rounding(quantum, exposure, ratio)).max(0.0)));
+            let n = (block * block) as f64;
+            let exposure = sum / n;
+            blocks.push(Sample { exposure, variance: (area * square / n - quantum(exposure)).max(0.0), blocks: 1.0 });
         }
         blocks
     };
-    let rows = h.saturating_sub(BLOCK + 2 * lag - 1).div_ceil(step);
-    (0..rows).into_par_iter().flat_map_iter(|n| row(lag + n * step)).collect()
+    let rows = h.saturating_sub(block + 1).div_ceil(step);
+    (0..rows).into_par_iter().flat_map_iter(|n| row(1 + n * step)).collect()
 }
 
 /// Part of the flattest blocks' samples that the fitted line passes above: texture lifts samples, and only samples of few blocks fall below.
@@ -286,7 +373,7 @@ fn fit(samples: &[Sample], below: f64) -> Option<NoiseModel> {
         samples
             .iter()
             .map(|s| {
-                let r = (s.variance / s.of(&NoiseModel { shot, read })).ln();
+                let r = (s.variance / NoiseModel { shot, read }.variance(s.exposure)).ln();
                 s.blocks * if r > 0.0 { below * r } else { (below - 1.0) * r }
             })
             .sum()
@@ -300,6 +387,9 @@ fn fit(samples: &[Sample], below: f64) -> Option<NoiseModel> {
         for i in 0..=STEPS {
             for j in 0..=STEPS {
                 let (a, b) = (at(shot, i), at(read, j));
+                if b - a > MOST_AT_BLACK.ln() {
+                    continue;
+                }
                 let l = loss(a.exp(), b.exp());
                 if l < best.0 {
                     best = (l, a, b);

@@ -6,34 +6,34 @@ use crate::exposure::Bracket;
 use crate::gpu::Gpu;
 use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::Kernels;
-use crate::mask;
-use crate::merge;
-use crate::noise::{self, NoiseModel};
-use crate::register::{self, Registrar, Registration};
+use crate::noise::{FrameNoise, NoiseModel};
+use crate::photometry::FramePhotometry;
+use crate::register::Registration;
 use crate::response::Response;
-use crate::triage::{self, Verdict};
-use crate::tsf::{Model, Tsf, TsfEntry, TsfFile};
+use crate::tsf::{Model, TsfFile};
 use glam::DMat3;
-use serde_json::{Value, json};
+use serde_json::Value;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 mod blind;
 mod engine;
-mod free;
+mod judge;
 mod observed;
+mod place;
+mod plan;
+mod prepare;
 mod progress;
-mod rounds;
+mod report;
 mod shaken;
-mod window;
+mod solve;
 
-use blind::AllBlurs;
 pub use blind::Blind;
 pub use engine::Engine;
 use engine::Memo;
+use prepare::Prepared;
 use progress::Progress;
-use rounds::{Sorted, Turned};
 
 /// What a user can set about a merge. `Default` is what the program uses when nothing is said.
 #[derive(Clone, Debug)]
@@ -59,7 +59,7 @@ pub struct Settings {
     pub psf_radius: Option<usize>,
     /// Side in pixels of the patches of [`Blind::Patches`]; `None`: 120.
     pub patch_size: Option<usize>,
-    /// Noise level of the frames; `None`: estimated from them.
+    /// Noise of the sensor, white and alike in all frames; `None`: estimated from each frame.
     pub noise: Option<NoiseModel>,
     /// What to do when no frame is sharp.
     pub blind: Blind,
@@ -160,10 +160,13 @@ pub struct Outcome {
     pub masks: Vec<Plane>,
     /// Local χ² of each frame (squared residual over what noise explains, 1 is perfect) on its own pixels; `None` for frames left out.
     pub misfit: Vec<Option<Plane>>,
-    /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 1).
+    /// Noise of each frame's exposures as the program estimated it.
+    pub noise: Vec<FrameNoise>,
+    /// Everything that was estimated, as JSON (`format` "unshaken-report", `version` 2).
     pub report: Value,
 }
 
+/// A merge under way.
 struct Run<'a> {
     gpu: &'a Gpu,
     kernels: &'a Kernels,
@@ -172,23 +175,26 @@ struct Run<'a> {
     bracket: &'a Bracket,
     response: &'a Response,
     settings: &'a Settings,
+    events: &'a mut dyn FnMut(Event) -> bool,
+    timings: Vec<(String, f64)>,
+    /// Exposures f⁻¹(Z) as they would be if every frame's gain were 1 and its black 0.
     exposures: Vec<Rgb>,
+    /// Noise of the exposures, and the standard deviations that the solver reads.
+    noise: Vec<FrameNoise>,
+    curves: Vec<[Vec<f32>; 3]>,
+    photometry: Vec<FramePhotometry>,
+    /// EV by which the pixels contradict what each file notes, and the standard deviation; times that are contradicted beyond doubt are replaced.
+    exposure_errors: Vec<(f64, f64)>,
     masks: Vec<Plane>,
     /// What part of its weight each sharp frame keeps where others show something else, on its own pixels; `None`: all of it.
     ghosts: Vec<Option<Plane>>,
-    /// What each frame's mask has been lessened to.
-    shares: Vec<f32>,
     /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
     looks: Vec<(Channels, Option<Plane>)>,
-    noise: NoiseModel,
-    curves: Vec<[Vec<f32>; 3]>,
     /// Where each frame lies, from the reference (centred pixels), and how that was found.
     motions: Vec<DMat3>,
     registrations: Vec<Registration>,
     left_out: Vec<(String, String)>,
     degraded: Vec<String>,
-    events: &'a mut dyn FnMut(Event) -> bool,
-    timings: Vec<(String, f64)>,
     blind: Value,
     /// What each displaced sharp frame shows of structure finer than the latent grid, taken off its exposure; none before it is known.
     aliasing: Vec<Option<Rgb>>,
@@ -226,7 +232,6 @@ pub fn merge_with(
     given: Option<&TsfFile>,
     events: &mut dyn FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let frames = bracket.frames();
     let excluded = check(bracket, settings)?;
     let stop = engine.stop.clone();
     let (gpu, kernels, memo) = engine.parts();
@@ -240,14 +245,9 @@ pub fn merge_with(
     };
     // TSFs that are given decide about every stage.
     memo.begin(if given.is_some() { None } else { Some(format!("{name} {:?}", settings.noise)) });
-    let (exposures, noise) = memo.prepared(|| {
-        let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
-        let noise = settings.noise.unwrap_or_else(|| noise::estimate(frames, &exposures, response));
-        (exposures, noise)
-    });
-    let curves = noise::curves(frames, response, &noise);
-    let motions = vec![DMat3::IDENTITY; frames.len()];
-    let verdicts = triage::triage(frames, &exposures, &curves, &excluded, settings.sharp.as_deref(), &motions);
+    let Prepared { corrected, exposures, noise, curves, exposure_errors } = prepare::prepared(memo, bracket, response, settings);
+    let bracket = corrected.as_ref().unwrap_or(bracket);
+    let n = bracket.frames().len();
     let mut run = Run {
         gpu,
         kernels,
@@ -256,25 +256,26 @@ pub fn merge_with(
         bracket,
         response,
         settings,
+        events,
+        timings: vec![("exposures and noise".into(), start.elapsed().as_secs_f64())],
         exposures,
-        masks: Vec::new(),
-        ghosts: vec![None; frames.len()],
-        shares: vec![1.0; frames.len()],
-        looks: Vec::new(),
         noise,
         curves,
-        motions,
-        registrations: vec![Registration::skipped(); frames.len()],
+        photometry: vec![FramePhotometry::AS_NOTED; n],
+        exposure_errors,
+        masks: Vec::new(),
+        ghosts: vec![None; n],
+        looks: Vec::new(),
+        motions: vec![DMat3::IDENTITY; n],
+        registrations: vec![Registration::skipped(); n],
         left_out: Vec::new(),
         degraded: Vec::new(),
-        events,
-        timings: Vec::new(),
         blind: Value::Null,
-        aliasing: vec![None; frames.len()],
+        aliasing: vec![None; n],
         scale: 1.0,
     };
-    run.timings.push(("noise and triage".into(), start.elapsed().as_secs_f64()));
-    run.reconstruct(verdicts, excluded, given)
+    run.tell_of_exposures()?;
+    run.reconstruct(excluded, given)
 }
 
 fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
@@ -370,351 +371,4 @@ impl Run<'_> {
         self.left_out.push((name, why.into()));
         Ok(())
     }
-
-    /// Registers the frames against each other, leaves out those that cannot be, and looks again which are sharp, pixel by pixel of the
-    /// scene. `known`: frames whose place the user gave.
-    fn align(&mut self, mut verdicts: Vec<Verdict>, excluded: &mut [bool], known: &[bool]) -> Result<Vec<Verdict>> {
-        let used: Vec<usize> = (0..excluded.len()).filter(|&i| !excluded[i]).collect();
-        let sharp: Vec<bool> = verdicts.iter().map(|v| v.sharp).collect();
-        let mut found = self.registered(&used, &sharp, known)?;
-        if let Some(again) = self.triaged_in_place(&found, &used, excluded) {
-            let now: Vec<bool> = again.iter().zip(&found).map(|(v, r)| v.sharp && r.registered).collect();
-            verdicts = again;
-            // Frames that lie elsewhere pass for shaken; now that they show to be sharp, they are placed as such, and show more of the scene to the others.
-            if used.iter().any(|&i| now[i] && !sharp[i]) {
-                found = self.registered(&used, &now, known)?;
-                verdicts = self.triaged_in_place(&found, &used, excluded).unwrap_or(verdicts);
-            }
-        }
-        for &i in &used {
-            if !found[i].registered {
-                if !found[i].doubtful {
-                    self.leave_out(i, &found[i].reason)?;
-                }
-                excluded[i] = true;
-            }
-        }
-        self.motions = found.iter().map(Registration::motion).collect();
-        self.registrations = found;
-        Ok(verdicts)
-    }
-
-    /// Which of the frames `used` are sharp where they lie, those that could not be registered left out; `None` where none moved and their noise is what it seemed: it
-    /// is known.
-    fn triaged_in_place(&self, found: &[Registration], used: &[usize], excluded: &[bool]) -> Option<Vec<Verdict>> {
-        let mut excluded = excluded.to_vec();
-        for &i in used {
-            excluded[i] |= !found[i].registered;
-        }
-        let motions: Vec<DMat3> = found.iter().map(Registration::motion).collect();
-        let moved = motions.iter().any(|m| *m != DMat3::IDENTITY) || used.iter().any(|&i| excluded[i]);
-        let placed: Vec<usize> = used.iter().copied().filter(|&i| !excluded[i]).collect();
-        let noise = self.smoothed_noise(&placed, &motions);
-        if !moved && noise.is_none() {
-            return None;
-        }
-        let frames = self.bracket.frames();
-        let curves = noise.map(|noise| noise::curves(frames, self.response, &noise));
-        let given = self.settings.sharp.as_deref();
-        Some(triage::triage(frames, &self.exposures, curves.as_ref().unwrap_or(&self.curves), &excluded, given, &motions))
-    }
-
-    /// The noise level of the frames `ids`, placed by `motions`, if a file format has made it smoother than it is; whether they are sharp is not known.
-    fn smoothed_noise(&self, ids: &[usize], motions: &[DMat3]) -> Option<NoiseModel> {
-        let frames = self.bracket.frames();
-        if self.settings.noise.is_some() || !ids.iter().any(|&i| frames[i].lossy) {
-            return None;
-        }
-        noise::of_squares(frames, &self.exposures, self.response, ids, motions, false, &self.noise)
-    }
-
-    /// Where the frames `used` lie, by the longest of those that are `sharp` or, if most do not fit that, by the next.
-    fn registered(&mut self, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
-        let best = |run: &Self, of: &[usize]| {
-            let still: Vec<usize> = of.iter().copied().filter(|&i| sharp[i]).collect();
-            run.bracket.longest(&still).or_else(|| run.bracket.shortest(of))
-        };
-        let first = self.settings.reference.or_else(|| best(self, used)).unwrap_or(0);
-        let found = self.register_on(first, used, sharp, known)?;
-        // If most do not fit the first reference, it may be the one that is not of the scene.
-        let misfits = |r: &[Registration]| used.iter().filter(|&&i| !r[i].registered).count();
-        if self.settings.reference.is_none() && used.len() > 2 && 2 * misfits(&found) >= used.len() {
-            let rest: Vec<usize> = used.iter().copied().filter(|&i| i != first).collect();
-            if let Some(second) = best(self, &rest) {
-                let other = self.register_on(second, used, sharp, known)?;
-                if misfits(&other) < misfits(&found) {
-                    return Ok(other);
-                }
-            }
-        }
-        Ok(found)
-    }
-
-    fn register_on(&mut self, reference: usize, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
-        let frames = self.bracket.frames();
-        let mut found = vec![Registration::skipped(); frames.len()];
-        let (exposures, curves) = (std::mem::take(&mut self.exposures), std::mem::take(&mut self.curves));
-        let mut registrar = Registrar::new(frames, &exposures, &curves, reference);
-        found[reference] = registrar.of_reference();
-        let mut going = Ok(());
-        for i in registrar.order(used, sharp).into_iter().filter(|&i| !known[i]) {
-            going = self.progress(&format!("registering {}", frames[i].name), 0.02);
-            if going.is_err() {
-                break;
-            }
-            found[i] = registrar.register(i, sharp[i]);
-        }
-        (self.exposures, self.curves) = (exposures, curves);
-        going.map(|()| found)
-    }
-
-    /// The noise level again, now that it is known that the frames `still` show the scene as it is: what a file format has made smooth could not be told
-    /// before.
-    fn measure_noise(&mut self, still: &[usize]) -> Result<()> {
-        if self.settings.noise.is_some() || still.len() < 2 {
-            return Ok(());
-        }
-        let frames = self.bracket.frames();
-        let noise = self.remembered(
-            "noise of sharp frames",
-            &format!("{still:?}"),
-            |_| 0,
-            |run| {
-                // Of files that keep their noise the first estimate is right, and what a registration that is not quite true leaves would pass for more.
-                let tells = |&i: &usize| frames[i].lossy || run.motions[i] == run.motions[still[0]];
-                let told: Vec<usize> = still.iter().copied().filter(tells).collect();
-                Ok(noise::of_squares(frames, &run.exposures, run.response, &told, &run.motions, true, &run.noise))
-            },
-        )?;
-        if let Some(noise) = noise {
-            self.take_noise(noise);
-        }
-        Ok(())
-    }
-
-    /// `noise` as the noise level of the frames, from here on.
-    fn take_noise(&mut self, noise: NoiseModel) {
-        self.curves = noise::curves(self.bracket.frames(), self.response, &noise);
-        self.noise = noise;
-    }
-
-    /// Motions from the frame `reference` instead.
-    fn rebase(&mut self, reference: usize) {
-        if self.motions[reference] == DMat3::IDENTITY {
-            return;
-        }
-        let (w, h) = self.bracket.size();
-        let back = self.motions[reference].inverse();
-        for (motion, found) in self.motions.iter_mut().zip(&mut self.registrations) {
-            *motion = register::rebased(motion, &back, w, h);
-            found.homography = register::rows(motion);
-        }
-    }
-
-    fn reconstruct(mut self, verdicts: Vec<Verdict>, mut excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<Outcome> {
-        let frames = self.bracket.frames();
-        let (w, h) = self.bracket.size();
-        let used: Vec<usize> = (0..frames.len()).filter(|&i| !excluded[i]).collect();
-        let mut tsfs: Vec<Option<Tsf>> = vec![None; frames.len()];
-        if let Some(file) = given {
-            for &i in &used {
-                tsfs[i] = file.find(&frames[i].name, w, h)?;
-                if tsfs[i].is_none() {
-                    self.warn(format!("{}: the TSF file does not hold it; its TSF is estimated", frames[i].name))?;
-                }
-            }
-        }
-        let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
-        let mut verdicts = if self.settings.align && used.iter().any(|&i| !known[i]) {
-            self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
-            let (verdicts, found, motions, registrations, left_out, degraded) = self.remembered(
-                "registration",
-                "",
-                |_| 0,
-                |run| {
-                    let verdicts = run.align(verdicts, &mut excluded, &known)?;
-                    Ok((
-                        verdicts,
-                        excluded.clone(),
-                        run.motions.clone(),
-                        run.registrations.clone(),
-                        run.left_out.clone(),
-                        run.degraded.clone(),
-                    ))
-                },
-            )?;
-            (excluded, self.motions, self.registrations) = (found, motions, registrations);
-            (self.left_out, self.degraded) = (left_out, degraded);
-            verdicts
-        } else {
-            self.memo.depends(&(&self.settings.exclude, &self.settings.sharp, self.settings.reference, self.settings.align));
-            verdicts
-        };
-        self.memo.depends(&(self.settings.alpha, self.settings.deghost, self.settings.blind, self.settings.deblur.interpolation));
-        let mut used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i]).collect();
-        for (motion, tsf) in self.motions.iter_mut().zip(&tsfs) {
-            if let Some(tsf) = tsf {
-                *motion = tsf.centre();
-            }
-        }
-        let mut sharp: Vec<bool> =
-            (0..frames.len()).map(|i| !excluded[i] && tsfs[i].as_ref().map_or(verdicts[i].sharp, |t| t.single().is_some())).collect();
-        let all_known = used.iter().all(|&i| tsfs[i].is_some());
-        let (mut scene, mut centre, mut reduced) = (None, None, false);
-        let forced = matches!(self.settings.blind, Blind::Joint | Blind::Patches) && given.is_none();
-        let may_doubt = given.is_none() && self.settings.sharp.is_none() && self.settings.blind == Blind::Auto;
-        let doubt = may_doubt.then(|| blind::doubted(&verdicts, &sharp, &used)).flatten();
-        if may_doubt {
-            for i in blind::untold(&verdicts, &sharp, &used, |ids| self.bracket.shortest(ids)) {
-                sharp[i] = false;
-                verdicts[i].reason = "nothing that another frame sees clearly as well tells whether it is sharp".into();
-            }
-            let (unsure, sure) = blind::unsure_beside(&verdicts, &sharp, &used);
-            if !unsure.is_empty() {
-                self.progress("looking whether frames that seem sharp moved", 0.02)?;
-                // Which frames count as sharp, and all that follows, now depends on the blurs found.
-                self.memo.depends(&(self.settings.model, self.settings.focal_px));
-                for i in self.remembered("frames that seem sharp", "", |_| 0, |run| run.confirmed(unsure, &sure))? {
-                    sharp[i] = false;
-                }
-            }
-        }
-        let merged_only = !forced && !all_known && !sharp.contains(&true) && self.settings.blind == Blind::Off;
-        let mut unexplained = merged_only;
-        if merged_only {
-            self.degrade("no frame is sharp: the frames are merged without deblurring; --blind auto tries to find all blurs".into())?;
-        } else if forced || doubt.is_some() || (!all_known && !sharp.contains(&true)) {
-            if self.settings.blind == Blind::Patches {
-                self.memo.depends(&(self.settings.psf_radius, self.settings.patch_size));
-            }
-            let (found, motions, blind, degraded) = self.remembered(
-                "all blurs",
-                "",
-                |_| 0,
-                |run| {
-                    let found = run.all_blurs(&used, doubt.as_ref(), 0.03, 0.60)?;
-                    Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
-                },
-            )?;
-            (self.motions, self.blind, self.degraded) = (motions, blind, degraded);
-            match found {
-                AllBlurs::Found(found) => {
-                    scene = Some(found.start);
-                    centre = Some(found.reference);
-                    reduced = found.reduced;
-                    for (&i, tsf) in used.iter().zip(found.tsfs) {
-                        sharp[i] = false;
-                        tsfs[i] = Some(tsf);
-                    }
-                }
-                AllBlurs::Sharp(still) => sharp.iter_mut().enumerate().for_each(|(i, s)| *s = still.contains(&i)),
-                AllBlurs::Unexplained => unexplained = true,
-            }
-        } else if !sharp.contains(&true) {
-            scene = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &tsfs))?);
-        }
-        if unexplained {
-            for &i in &used {
-                sharp[i] = true;
-            }
-        }
-        // What no part of a frame tells, its blur may, beside sharp frames.
-        let beside = !unexplained && scene.is_none() && sharp.contains(&true);
-        let doubtful: Vec<usize> = (0..frames.len()).filter(|&i| self.registrations[i].doubtful).collect();
-        for i in doubtful {
-            if beside {
-                used.push(i);
-                verdicts[i].reason = "shaken so far that no part of it tells by itself where it lies".into();
-            } else {
-                self.leave_out(i, &self.registrations[i].reason.clone())?;
-            }
-        }
-        used.sort_unstable();
-        let may_have_moved = match &doubt {
-            Some(doubt) => !doubt.show_surely_the_same(),
-            None => may_doubt && blind::less_detailed(&verdicts, &used),
-        };
-        self.deblurred(Sorted {
-            verdicts,
-            known,
-            used,
-            sharp,
-            tsfs,
-            scene,
-            centre,
-            reduced,
-            unexplained,
-            may_have_moved,
-            turned: Turned::Not,
-        })
-    }
-
-    fn finish(
-        mut self,
-        solution: Solution,
-        reference: usize,
-        verdicts: &[Verdict],
-        sharp: &[bool],
-        all: &[usize],
-        tsfs: &[Option<Tsf>],
-        details: Vec<Value>,
-    ) -> Result<Outcome> {
-        let frames = self.bracket.frames();
-        let (w, h) = self.bracket.size();
-        let mut irradiance = solution.cropped();
-        // What a blurred frame clips, blur has spread: it bounds nothing.
-        let unblurred: Vec<usize> = all.iter().copied().filter(|&i| tsfs[i].as_ref().is_none_or(|t| t.single().is_some())).collect();
-        merge::raise_to_lower_bound(&mut irradiance, self.bracket, &self.exposures, &unblurred, &self.motions);
-        let scale = frames[reference].exposure_time as f32;
-        let irradiance = irradiance.map_planes(|p| p.map(|v| v * scale));
-        let entries: Vec<Value> = (0..frames.len())
-            .map(|i| {
-                let position = all.iter().position(|&k| k == i);
-                json!({
-                    "frame": frames[i].name,
-                    "exposure_time_s": frames[i].exposure_time,
-                    "used": position.is_some(),
-                    "sharp": sharp[i],
-                    "triage": verdicts[i],
-                    "registration": self.registrations[i],
-                    "chi_squared": position.map(|p| solution.report.chi_squared[p]),
-                    "ghosts": self.ghosts[i].as_ref().map(|g| 1.0 - g.data.iter().map(|v| f64::from(*v)).sum::<f64>() / g.data.len() as f64),
-                    "aliasing_rms": self.aliasing[i].as_ref().map(root_mean_square),
-                    "blur": details[i],
-                    "tsf": tsfs[i].as_ref().map(|t| TsfEntry::new(&frames[i].name, w, h, t)),
-                })
-            })
-            .collect();
-        let blind = self.blind_report();
-        let report = json!({
-            "format": "unshaken-report",
-            "version": 1,
-            "program": concat!("unshaken ", env!("CARGO_PKG_VERSION")),
-            "adapter": self.gpu.description,
-            "size": [w, h],
-            "reference": frames[reference].name,
-            "scale": { "rule": "value = irradiance * exposure time of the reference frame", "factor_s": scale },
-            "noise": self.noise,
-            "blind": blind,
-            "frames": entries,
-            "degraded": self.degraded,
-            "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
-            "solver": solution.report,
-            "timings_s": std::mem::take(&mut self.timings),
-        });
-        let mut misfit: Vec<Option<Plane>> = vec![None; frames.len()];
-        for (&i, plane) in all.iter().zip(solution.misfit) {
-            misfit[i] = Some(plane);
-        }
-        let places = (0..frames.len()).map(|i| tsfs[i].as_ref().map_or(self.motions[i], Tsf::centre)).collect();
-        let masks = (0..frames.len()).map(|i| self.counting(i, &mask::spoilt_channels(&frames[i]))).collect();
-        let Self { left_out, degraded, .. } = self;
-        Ok(Outcome { irradiance, reference, left_out, degraded, places, masks, misfit, report })
-    }
-}
-
-/// Over all values of all channels.
-fn root_mean_square(image: &Rgb) -> f64 {
-    let squares = image.0.iter().flat_map(|p| &p.data).map(|v| f64::from(v * v));
-    (squares.sum::<f64>() / (3 * image.width() * image.height()) as f64).sqrt()
 }

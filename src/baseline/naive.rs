@@ -31,7 +31,7 @@ pub fn deblur_each(
     let (width, height) = bracket.size();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
     let level = noise::estimate(frames, &exposures, response);
-    let curves: Vec<[Vec<f32>; 3]> = frames.iter().map(|f| std::array::from_fn(|c| level.curve(response, c, f.levels))).collect();
+    let curves = noise::curves(frames, response, &level);
     // Without a low taper no frame looks at another, and where they lie does not matter.
     let masks = mask::masks(frames, &vec![false; frames.len()], 0.0, &vec![DMat3::IDENTITY; frames.len()], Channels::ALL);
     let shaken: Vec<usize> = (0..frames.len()).filter(|&i| !tsfs[i].is_identity()).collect();

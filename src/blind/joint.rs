@@ -11,7 +11,6 @@ use crate::random::Random;
 use crate::sampling::bilinear;
 use crate::tsf::{self, Latent, Stride, Tsf, WholeFrame};
 use glam::{DMat3, DVec2};
-use nalgebra::Matrix2;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::borrow::Cow;
@@ -40,20 +39,10 @@ pub struct Joint {
     pub held_out: Vec<f64>,
     /// The same for a scene solved from the frames as they are placed, unblurred: what a merge explains.
     pub held_out_merge: Vec<f64>,
-    /// By how much `held_out` (geometric mean) grows if the frames in doubt did not move; 1 where there are none.
-    pub if_still: f64,
     /// Standard deviation in pixels of the blur that all frames share and that is not motion: the lens's; 0 where none was found.
     pub lens_px: f32,
     /// What TSFs were fitted to at the second level, or on the one that there is, the least residual first; none where frames in doubt stood still.
     pub ways: Vec<Way>,
-    seen: Look,
-}
-
-impl Joint {
-    /// By how much the residuals of all frames (geometric mean) grow if the frames `still`, positions among them, did not move, behind the lens that was found.
-    pub fn if_held(&self, still: &[usize]) -> f64 {
-        self.seen.if_still(still)
-    }
 }
 
 /// What TSFs are fitted to.
@@ -75,36 +64,6 @@ pub struct Way {
     pub fitted_to: FittedTo,
     /// Geometric mean over the frames of the squared residual over noise variance on pixels that no part of the estimate has seen.
     pub held_out: f64,
-}
-
-/// What was found once frames that were taken for sharp might move.
-pub struct Freed {
-    /// See [`Joint::tsfs`].
-    pub tsfs: Vec<Tsf>,
-    /// See [`Joint::luminance`].
-    pub luminance: Plane,
-    /// See [`Joint::scale`].
-    pub scale: usize,
-    /// Extent of each frame's blur in pixels.
-    pub extents: Vec<f64>,
-    /// Squared held-out residuals over noise variance, geometric mean over the frames.
-    pub held_out: f64,
-    /// The same over that with the frames held still.
-    pub left: f64,
-    /// By how much the blurs of the frames set free differ from each other (most of two), that of one alone from a round one: the norm (Frobenius) of
-    /// the difference of the covariances of their translations over the sum of both traces, 0 for blurs alike. A lens, and what a scene
-    /// has of it for the smoothness that is asked of it, blurs all frames alike and in all directions or nearly so; hands do not.
-    pub unlike: f64,
-    seen: Look,
-    /// The frames set free.
-    free: Vec<usize>,
-}
-
-impl Freed {
-    /// By how much the residuals of all frames (geometric mean) grow if those set free did not move after all, everything else following from there.
-    pub fn if_still(&self) -> f64 {
-        self.seen.if_still(&self.free)
-    }
 }
 
 /// A way to begin.
@@ -161,13 +120,6 @@ const DRAWN: (usize, f32) = (15, 1.5);
 /// Iterations by which the TSFs of a round are refined, at the coarsest level and at finer ones. More at the coarsest follow what the luminance of that
 /// round still lacks, and are lost on it: with eight the estimate takes twice as long and ends no better.
 const REFINED: (usize, usize) = (4, 8);
-/// Rounds after which frames that were held still have moved as far as they will, and those after which it is seen whether they move at all:
-/// whether the residuals fall below this part of what they were, or their blurs become unlike.
-const FREED: (usize, usize, f64) = (6, 3, 0.97);
-/// [`Freed::unlike`] up to which blurs are alike by then.
-const ALIKE: f64 = 0.1;
-/// Rounds of luminance and TSFs under the assumption that frames did not move.
-const STILLED: usize = 4;
 /// Standard deviations of the lens's blur that are tried at the second level, in pixels of it, and the residuals over those behind the sharper one below which
 /// a softer one is gone on with.
 const LENSES: [f32; 3] = [0.7, 1.0, 1.4];
@@ -428,33 +380,6 @@ impl Level {
         energies.iter().map(|e| Stride::new(if all > 0.0 { e / all } else { 1.0 })).collect()
     }
 
-    /// `state` if the frames `still` had not moved: each as far as its mean pose went, and those and the other frames' TSFs follow.
-    fn stilled(&self, state: &State, still: &[usize]) -> State {
-        let mut state = state.clone();
-        for &k in still {
-            let mean = Pose { weight: 1.0, ..state.tsfs[k].mean() };
-            state.tsfs[k].poses = vec![mean];
-        }
-        let error = MODEL_ERROR.1;
-        for _ in 0..STILLED {
-            self.solve(&mut state, 1.0, error, 3);
-            let seen = self.seen(&state.latent);
-            let fit = |k: usize| {
-                let (frame, tsf) = (&self.frames[k], &state.tsfs[k]);
-                if !still.contains(&k) {
-                    return self.fit(frame, &seen, Some(tsf), error);
-                }
-                let weight = self.weight(frame, error);
-                let whole = WholeFrame { latent: &seen, pad: self.pad, blurred: &frame.blurred, weight: &weight, base: tsf.base };
-                Some(whole.refine(tsf, REFINED.1))
-            };
-            let fits: Vec<Option<Tsf>> = (0..self.frames.len()).into_par_iter().map(fit).collect();
-            state.take(fits);
-        }
-        self.settle(&mut state);
-        state
-    }
-
     /// How much the pixels of `frame` count for its TSF where operators err by `model_error`.
     fn weight(&self, frame: &Frame, model_error: f32) -> Plane {
         let local = gradient_level(&frame.blurred, 4);
@@ -475,30 +400,6 @@ impl Level {
             _ => whole.fit_grid(&self.grid, start)?,
         };
         without_faint(&whole.refine(&rough, if self.near { REFINED.1 } else { REFINED.0 }))
-    }
-
-    /// See [`Look::if_still`].
-    fn growth(&self, state: &State, still: &[usize]) -> f64 {
-        let judge = |state: &State| geometric_mean(&self.judge(state));
-        judge(&self.stilled(state, still)) / judge(state)
-    }
-
-    /// See [`Look::if_still_behind_lens`].
-    fn growth_behind_lens(&self, state: &State, still: &[usize]) -> Option<f64> {
-        // All by as many rounds: they gain by those alone.
-        let judge = |level: &Level, still: &[usize]| geometric_mean(&level.judge(&level.stilled(state, still)));
-        let mut least = judge(self, &[]);
-        let mut growth = None;
-        for lens_px in LENSES {
-            let behind = Level { lens_px, ..self.clone() };
-            let moved = judge(&behind, &[]);
-            if moved >= SHARPER * least {
-                break;
-            }
-            least = moved;
-            growth = Some(judge(&behind, still) / moved);
-        }
-        growth
     }
 
     /// Mean squared residual over variance of each frame on the held-out pixels.
@@ -526,12 +427,6 @@ impl Level {
             latent: shrunk(scene, self.scale).padded(self.pad),
             tsfs: tsfs.iter().map(|t| t.scaled(1.0 / self.scale as f64)).collect(),
         }
-    }
-
-    /// Extent of each frame's blur in pixels of the frame.
-    fn extents(&self, state: &State) -> Vec<f64> {
-        let (w, h) = self.size;
-        state.tsfs.iter().map(|t| self.scale as f64 * tsf::extent(t, w, h)).collect()
     }
 
     /// TSFs and luminance of `state` on frames of `size`, the whole one.
@@ -628,14 +523,14 @@ fn at_finer(
 }
 
 /// What the coarsest level tells.
-pub struct Look {
+struct Look {
     level: Level,
     state: State,
 }
 
 impl Look {
     /// At `frames` from the better of `starts`. `None` as for [`estimate`].
-    pub fn at(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Self> {
+    fn at(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Self> {
         let scale = coarsest(frames);
         let (mut done, total) = (0, ROUNDS.0 * starts.len());
         let level = Level::new(frames, scale, false);
@@ -644,24 +539,6 @@ impl Look {
             progress(Stage { scale, fraction: done as f32 / total as f32 })
         })?;
         Some(Self { level, state })
-    }
-
-    /// By how much the residuals of all frames (geometric mean) grow if the frames `still`, positions among those looked at, did not move. Sharp
-    /// frames of a scene with soft edges, displaced by parts of a pixel, are explained as well by a scene with harder ones and some blur:
-    /// an extent alone does not tell.
-    pub fn if_still(&self, still: &[usize]) -> f64 {
-        self.level.growth(&self.state, still)
-    }
-
-    /// The same where all frames are behind the lens that explains them best; `None` where none explains them clearly better than motion alone. Beside a motion of
-    /// its own that a frame is given, a lens is no motion of it.
-    pub fn if_still_behind_lens(&self, still: &[usize]) -> Option<f64> {
-        self.level.growth_behind_lens(&self.state, still)
-    }
-
-    /// Extent of each frame's blur in pixels: for frames of a few hundred pixels enough to know which of them stood still.
-    pub fn extents(&self) -> Vec<f64> {
-        self.level.extents(&self.state)
     }
 }
 
@@ -695,36 +572,20 @@ fn at_last(
     Some((level, state))
 }
 
-/// Frames that may not have moved.
-pub struct Doubted<'a> {
-    /// Positions among the frames; none where all did.
-    pub frames: &'a [usize],
-    /// Growth of the residuals, if they are held, up to which they stood still: no TSFs are to be cross-validated then.
-    pub at_most: f64,
-}
-
-/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`; `look` where one at these frames from these starts was
-/// taken already. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
 /// ends the work: `None`, as for no start.
-pub fn estimate(
-    frames: &[Frame],
-    starts: &[Start],
-    look: Option<Look>,
-    doubted: &Doubted,
-    merged: (&Plane, &[Tsf]),
-    progress: &mut dyn FnMut(Stage) -> bool,
-) -> Option<Joint> {
+pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
     let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     // Small frames have one level, on which the second's work is done as well.
     let scale = (first / 2).max(last);
-    let in_doubt = !doubted.frames.is_empty();
-    let search = if look.is_none() { cost(first, ROUNDS.0 * starts.len()) } else { 0.0 };
-    let mut total = search + cost(first, DRAWN_ROUNDS.0) + cost(scale, ROUNDS.1 * (1 + LENSES.len()) + DRAWN_ROUNDS.1 + STEPS.0);
+    let mut total = cost(first, ROUNDS.0 * starts.len())
+        + cost(first, DRAWN_ROUNDS.0)
+        + cost(scale, ROUNDS.1 * (1 + LENSES.len()) + DRAWN_ROUNDS.1 + STEPS.0);
     let mut s = scale;
     while s > last {
         s /= 2;
-        total += if in_doubt { 2.0 } else { 1.0 } * cost(s, ROUNDS.2);
+        total += cost(s, ROUNDS.2);
     }
     let (mut done, total) = (0.0, Cell::new(total));
     let mut advance = |scale: usize| {
@@ -732,34 +593,17 @@ pub fn estimate(
         progress(Stage { scale, fraction: done / total.get() })
     };
 
-    let look = match look {
-        Some(look) => look,
-        None => Look::at(frames, starts, &mut |s| advance(s.scale))?,
-    };
-    let (level, state, ways, if_still) = 'found: {
+    let look = Look::at(frames, starts, &mut |s| advance(s.scale))?;
+    let (level, state, ways) = {
         let mut level = Level::new(frames, scale, true);
         let fitted_to_best = |level: &Level, advance: &mut dyn FnMut(usize) -> bool| {
             at_finer(level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))
         };
-        let (mut best, mut growth) = (None, 1.0);
-        if in_doubt {
-            let fitted = fitted_to_best(&level, &mut advance)?;
-            // Asked of these, since the TSFs of frames that are held still follow by fits to the best scene, too.
-            let (level, end) = at_last(frames, level.clone(), fitted.clone(), last, None, &mut advance)?;
-            growth = level.growth(&end, doubted.frames);
-            if growth < doubted.at_most {
-                break 'found (level, end, Vec::new(), growth);
-            }
-            best = Some(fitted);
-        }
         // Which way is the better one tells this level, not the first. Fitted to the best scene, which is blurred, TSFs are too short; to drawn ones, where a
         // blur is not much longer than a pixel of the first level or the scene is not what the smoothness takes it for, too long.
         let mut random = Random::new(SEED, 1);
         let drawn = drawn_at_coarsest(&look, &mut random, &mut || advance(first))?;
-        let best = match best {
-            Some(best) => best,
-            None => fitted_to_best(&level, &mut advance)?,
-        };
+        let best = fitted_to_best(&level, &mut advance)?;
         // A soft scene makes for TSFs that are too thick, all by the same: these explain the frames less well than a lens does.
         let mut best = (geometric_mean(&level.judge(&best)), best);
         for (tried, lens_px) in LENSES.into_iter().enumerate() {
@@ -786,7 +630,7 @@ pub fn estimate(
         let (_, (state, draws)) = better(Some(fitted), (judged(FittedTo::Unseen, &unseen), (unseen, Some(Random::new(SEED, 3)))));
         ways.sort_by(|a, b| a.held_out.total_cmp(&b.held_out));
         let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
-        (level, state, ways, growth)
+        (level, state, ways)
     };
     let held_out = level.judge(&state);
     // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
@@ -796,8 +640,7 @@ pub fn estimate(
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
     let lens_px = level.lens_px * level.scale as f32;
     let reference = state.reference;
-    let seen = Look { level, state };
-    Some(Joint { luminance, tsfs, lens_px, scale: last, reference, held_out, held_out_merge, if_still, ways, seen })
+    Some(Joint { luminance, tsfs, lens_px, scale: last, reference, held_out, held_out_merge, ways })
 }
 
 /// Whether frames of this size are worked on as they are, not at a smaller one.
@@ -827,78 +670,6 @@ pub fn cross_validated(
     // No frame at another's expense.
     let worse = before.iter().zip(&after).any(|(before, after)| *after > WORSE * before);
     Some(if !worse && geometric_mean(&after) < geometric_mean(&before) { found.tsfs } else { tsfs.to_vec() })
-}
-
-/// See [`Freed::unlike`], of blurs with the covariances `spreads`.
-fn unlike(spreads: &[Matrix2<f64>]) -> f64 {
-    let over = |difference: Matrix2<f64>, light: f64| if light > 0.0 { difference.norm() / light } else { 0.0 };
-    match spreads {
-        [one] => over(one - Matrix2::identity() * (0.5 * one.trace()), one.trace()),
-        _ => {
-            let pairs = spreads.iter().enumerate().flat_map(|(i, a)| spreads[..i].iter().map(move |b| (a, b)));
-            pairs.map(|(a, b)| over(a - b, a.trace() + b.trace())).fold(0.0, f64::max)
-        }
-    }
-}
-
-/// What the blurs of all `frames` become where those taken for sharp, `still`, may have moved as well: from the scene as these show it, `latent`, and
-/// the TSFs that follow from it, `tsfs`, of which the frame `reference` lies about the identity. TSFs are fitted to drawn scenes: the best one
-/// has the blur that those frames share, and under it they stand still. From nearby that finds a blur of a pixel or two, which the coarse
-/// levels of [`estimate`] cannot tell. Where residuals hardly fall and blurs stay alike the rounds end early. `None` where `progress` returns `false`.
-pub fn freed(
-    frames: &[Frame],
-    latent: &Plane,
-    tsfs: &[Tsf],
-    still: &[usize],
-    reference: usize,
-    progress: &mut dyn FnMut(Stage) -> bool,
-) -> Option<Freed> {
-    let scale = finest(frames);
-    let level = Level::new(frames, scale, true);
-    let mut state = level.stilled(&level.placed(latent, tsfs, reference), still);
-    let residual = |state: &State| geometric_mean(&level.judge(state));
-    let at_rest = residual(&state);
-    let settled = |state: &State| {
-        let mut state = state.clone();
-        level.settle(&mut state);
-        let left = residual(&state);
-        (state, left)
-    };
-    let apart = |tsfs: &[Tsf]| {
-        let spreads: Vec<Matrix2<f64>> = still.iter().map(|&k| Matrix2::from_column_slice(&tsfs[k].covariance().to_cols_array())).collect();
-        unlike(&spreads)
-    };
-    let (rounds, first, hardly) = FREED;
-    let mut random = Random::new(SEED, 2);
-    let (state, held_out) = 'moved: {
-        for k in 0..rounds {
-            if !progress(Stage { scale, fraction: (k + 1) as f32 / (rounds + 1) as f32 }) {
-                return None;
-            }
-            if k == first {
-                let found = settled(&state);
-                if found.1 > hardly * at_rest && apart(&found.0.tsfs) < ALIKE {
-                    break 'moved found;
-                }
-            }
-            let t = k as f32 / (rounds - 1) as f32;
-            level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), Some(&mut random));
-        }
-        settled(&state)
-    };
-    let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
-    let (extents, unlike) = (level.extents(&state), apart(&tsfs));
-    Some(Freed {
-        tsfs,
-        luminance,
-        scale,
-        extents,
-        held_out,
-        left: held_out / at_rest,
-        unlike,
-        seen: Look { level, state },
-        free: still.to_vec(),
-    })
 }
 
 #[cfg(test)]

@@ -131,7 +131,7 @@ pub(super) struct MergeArgs {
     /// Interpolation of the blurred frames' warps
     #[arg(long, value_name = "KERNEL", value_parser = ["bilinear", "bicubic", "six-point"], default_value = "bicubic")]
     pub interpolation: String,
-    /// When no frame is sharp: auto (all blurs and the scene together; also when frames only pass for sharp and all turn out to have moved), joint (so whatever passes for sharp), patches (the paper's way: from pairs of patches), off (merge only) [default: auto]
+    /// When no frame is sharp: auto (all blurs and the scene together, if the shortest frame is soft and that explains the frames better), joint (in any case), patches (the paper's way: from pairs of patches), off (the shortest frame counts as sharp) [default: auto]
     #[arg(long, value_name = "auto|joint|patches|off")]
     pub blind: Option<String>,
     /// Use these TSFs instead of estimating them (frames are found by file name, without folder)

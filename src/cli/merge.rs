@@ -41,7 +41,7 @@ pub(super) fn run(args: &MergeArgs) -> anyhow::Result<Done> {
             events(event)
         })?;
         let text = job.write(&targets, &opened, &opened.bracket, &outcome, &warnings, events)?;
-        let as_asked = opened.degraded.is_empty() && outcome.degraded.is_empty();
+        let as_asked = outcome.degraded.is_empty();
         let quality = if as_asked { Done::AsAsked } else { Done::Degraded };
         Ok((text, quality))
     })?;
@@ -63,8 +63,6 @@ pub(super) struct Opened {
     pub response: Response,
     /// What the report says of the response.
     origin: Value,
-    /// Why the response is less than was asked for.
-    degraded: Vec<String>,
     /// Noise that the files note.
     noise: Option<NoiseModel>,
     /// Of each frame, linear RGB to XYZ relative to D50.
@@ -180,8 +178,8 @@ impl Job<'_> {
         let stated = stated.filter(|_| linear || !jpeg && args.response.as_deref() != Some("auto"));
         let (stated_by, stated) = stated.map_or((None, None), |(what, response)| (Some(what), Some(response)));
         let by_file = self.response.is_none().then_some(stated_by).flatten();
-        let chosen = super::response::choose(args, self.response.clone().or(stated), &bracket, events)?;
-        let (response, mut origin, degraded) = (chosen.response, chosen.report, chosen.degraded);
+        let chosen = super::response::choose(args, self.response.clone().or(stated), &bracket, events);
+        let (response, mut origin) = (chosen.response, chosen.report);
         if let Some(what) = by_file {
             origin["origin"] = json!(format!("stated by the files: {what}"));
         }
@@ -189,7 +187,7 @@ impl Job<'_> {
             let text = "--exclude leaves one frame: what it clips or drowns in noise, no other frame can fill in";
             events(Event::Warning(text.into()));
         }
-        Ok(Opened { bracket: Arc::new(bracket), response, origin, degraded, noise, to_xyz, metadata, relative, notes })
+        Ok(Opened { bracket: Arc::new(bracket), response, origin, noise, to_xyz, metadata, relative, notes })
     }
 
     /// The settings for frames of full size.
@@ -245,15 +243,12 @@ impl Job<'_> {
                 (None, Some(_)) => "noted by the files",
                 (None, None) => "estimated from the frames",
             };
-            let degraded: Vec<&String> = opened.degraded.iter().chain(&outcome.degraded).collect();
-            let degraded = json!(degraded);
             let outcome = outcome.to_mut();
             if let Some(report) = outcome.report.as_object_mut() {
                 report.insert("response".into(), opened.origin.clone());
                 report.insert("noise_origin".into(), json!(noise_origin));
                 report.insert("exposure_notes".into(), json!(opened.notes));
                 report.insert("warnings".into(), json!(warnings));
-                report.insert("degraded".into(), degraded);
                 report.insert(
                     "colour".into(),
                     json!({ "primaries": photo.primaries, "outside_share": outside, "white_cd_m2": noted.white_luminance(), "absolute": absolute.is_some() }),

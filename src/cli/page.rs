@@ -122,7 +122,7 @@ impl Page<'_> {
                 (true, false) => "shaken, deblurred",
             };
             let chi = entry["chi_squared"].as_f64().map_or(String::new(), |c| format!("; residual {c:.2} times its noise"));
-            let reason = entry["triage"]["reason"].as_str().unwrap_or_default();
+            let reason = entry["judgement"]["reason"].as_str().unwrap_or_default();
             let _ = write!(
                 out,
                 "<section><h3>{}: {}</h3><p>{} s; {state}{chi}. {}</p><div class=\"row\">",

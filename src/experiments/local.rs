@@ -28,7 +28,7 @@ pub(super) fn seen(bracket: &Bracket, response: &Response, i: usize, latent: &Pl
     let (clipped, local, exposure) = (mask::clipped(&frames[i], Channels::ALL), gradient_level(latent, 4), exposures[i].mean());
     let weight = |p: usize| {
         let x = exposure.data[p];
-        let variance = level.variance(f64::from(x)) as f32 / 3.0 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
+        let variance = level[i].variance_of_mean(Channels::ALL, f64::from(x)) as f32 / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
         if clipped[p] { 0.0 } else { 1.0 / variance }
     };
     let weight = Plane { data: (0..exposure.data.len()).map(weight).collect(), ..exposure };

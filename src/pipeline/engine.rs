@@ -1,9 +1,7 @@
 //! An open device that remembers what earlier merges found, so that a changed setting runs only the stages that it touches.
 
 use crate::gpu::Gpu;
-use crate::image::Rgb;
 use crate::kernels::Kernels;
-use crate::noise::NoiseModel;
 use std::any::Any;
 use std::fmt::Debug;
 use std::sync::Arc;
@@ -132,16 +130,5 @@ impl Memo {
         while self.kept.len() > KEPT || self.kept.iter().map(|k| k.bytes).sum::<usize>() > ROOM {
             self.kept.remove(0);
         }
-    }
-
-    /// Exposures and noise, made or remembered.
-    pub fn prepared(&mut self, make: impl FnOnce() -> (Vec<Rgb>, NoiseModel)) -> (Vec<Rgb>, NoiseModel) {
-        if let Some((found, _)) = self.recall("exposures") {
-            return found;
-        }
-        let found = make();
-        let pixels: usize = found.0.iter().map(|e| e.width() * e.height()).sum();
-        self.keep("exposures", &found, 0, 12 * pixels);
-        found
     }
 }

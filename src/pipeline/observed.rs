@@ -81,8 +81,8 @@ impl Run<'_> {
 
     /// The mask by which frame `i` counts in the solver. `clipped`: its [`mask::spoilt_channels`].
     pub(super) fn counting(&self, i: usize, clipped: &[Vec<bool>; 3]) -> Plane {
-        let (all, kept) = (self.shares[i], self.ghosts[i].as_ref());
-        let share = |p: usize| all * kept.map_or(1.0, |k| k.data[p]);
+        let kept = self.ghosts[i].as_ref();
+        let share = |p: usize| kept.map_or(1.0, |k| k.data[p]);
         mask::with_partly_clipped(&self.masks[i], &self.bracket.frames()[i], clipped, self.settings.alpha as f32, share)
     }
 

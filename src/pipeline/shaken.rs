@@ -1,11 +1,13 @@
-//! Blurs of shaken frames against the irradiance that others show: their TSFs, their PSFs, and whether they explain them.
+//! Blurs of shaken frames against the irradiance that others show: their TSFs and their PSFs.
 
 use super::Run;
+use super::judge::{self, BlurEvidence};
+use super::plan::evidence;
 use crate::channels;
 use crate::deblur::{self, Prior};
-use crate::error::Result;
 use crate::image::{Channels, Plane, Rgb};
 use crate::merge;
+use crate::noise;
 use crate::pose::project;
 use crate::psf;
 use crate::register;
@@ -16,20 +18,6 @@ use serde_json::{Value, json};
 
 /// Iterations of [`Run::refine`].
 const REFINED: usize = 8;
-/// Squared residual over noise variance up to which a blurred frame is believed whatever else holds: true TSFs reach 1 to 2 on noisy
-/// frames, more on clean ones, where the interpolation's own error shows.
-const HOPELESS: f64 = 8.0;
-/// Squares along the longer side over which that is judged, their least side in pixels, and how many have to speak.
-const SQUARES: usize = 48;
-const LEAST_SQUARE: usize = 8;
-const FEWEST_SQUARES: usize = 6;
-/// Where a frame's blur leaves far more than noise, it must explain all but this part of what the sharp frames alone, unblurred, leave unexplained.
-pub(super) const UNEXPLAINED: f64 = 0.25;
-/// Length in pixels ([`tsf::stroke`]) from which it has to: a shorter blur leaves as much more of it as it is shorter, since lamps and edges as hard
-/// as a pixel show what the warps cannot (under one of 1.5 px half of it and more).
-pub(super) const LONG: f64 = 12.0;
-/// Extent in pixels below which a blur is slight: without it the deblurred scene explains its frame nearly as well, so that it is not judged by that.
-pub(super) const SLIGHT: f64 = 4.0;
 /// Outer iterations of the rounds before the last.
 const FIRST_OUTER: usize = 2;
 /// Local PSFs per blurred frame.
@@ -38,6 +26,10 @@ const PATCHES: usize = 9;
 const PATCH_SIZE: usize = 96;
 /// Pixels around the path of a blur at a patch in which its PSF is looked for.
 const PSF_MARGIN: isize = 3;
+/// Pixels of a blur's path at a patch beyond which its PSF is not described: some thousand unknowns would take longer than everything else.
+const LONGEST_PATH: usize = 80;
+/// Sizes at which a frame is looked at for whether it moved: 1, 1/2, 1/4.
+const LOOKED_AT: usize = 3;
 /// Displacement in pixels of a blurred frame that the search for its poses covers by itself.
 const SEARCHED: f64 = 3.0;
 /// Standard deviation of the operator's own error, as a part of the mean absolute gradient around a pixel.
@@ -58,51 +50,6 @@ impl Luminances {
 }
 
 impl Run<'_> {
-    /// Whether the blur of frame `i` fails to explain it: `misfit` is the local χ² with it, `start` the irradiance before the frame counted.
-    /// Judged over squares of the frame in which one or the other is far above the noise, by the one in the middle: what moved, or a lamp
-    /// that blur spreads beyond white, is a part of the frame and not its shake. It fails where it leaves more than `most` of what is left without; the χ² of
-    /// the square in the middle, where it does.
-    pub(super) fn unexplained(&self, i: usize, misfit: &Plane, start: &Rgb, most: f64) -> Option<f64> {
-        let without = self.unblurred(i, start);
-        let (w, h) = misfit.size();
-        let side = (w.max(h) / SQUARES).max(LEAST_SQUARE);
-        let mut squares: Vec<(f64, f64)> = Vec::new();
-        for y in (0..h).step_by(side) {
-            for x in (0..w).step_by(side) {
-                let (mut with_blur, mut unblurred, mut count) = (0.0, 0.0, 0);
-                for p in (y..(y + side).min(h)).flat_map(|y| (x..(x + side).min(w)).map(move |x| y * w + x)) {
-                    if without.data[p].is_finite() {
-                        with_blur += f64::from(misfit.data[p]);
-                        unblurred += f64::from(without.data[p]);
-                        count += 1;
-                    }
-                }
-                let (c, u) = (with_blur / f64::from(count), unblurred / f64::from(count));
-                if count as usize >= side * side / 4 && c.max(u) > HOPELESS {
-                    squares.push((c, c / u));
-                }
-            }
-        }
-        if squares.len() < FEWEST_SQUARES {
-            return None;
-        }
-        let middle = |mut v: Vec<f64>| {
-            v.sort_by(f64::total_cmp);
-            v[v.len() / 2]
-        };
-        let chi = middle(squares.iter().map(|s| s.0).collect());
-        let left = middle(squares.iter().map(|s| s.1).collect());
-        (chi > HOPELESS && left > most).then_some(chi)
-    }
-
-    /// Squared residual over variance of frame `i` against the irradiance `latent`, moved but not blurred; NaN where it is masked.
-    fn unblurred(&self, i: usize, latent: &Rgb) -> Plane {
-        let (exposure, mask) = (&self.exposures[i], &self.masks[i]);
-        let (seen, inside) = self.seen(latent, &self.motions[i]);
-        let mask = mask.zip(&inside, |m, k| m * k);
-        merge::misfit(&seen, exposure, &mask, &self.curves[i], self.bracket.frames()[i].exposure_time)
-    }
-
     /// Motion about which the poses of the blurred frame `i` are looked for: the search covers what is left.
     fn base(&self, i: usize) -> DMat3 {
         let (w, h) = self.bracket.size();
@@ -128,7 +75,7 @@ impl Run<'_> {
         let frame = &self.bracket.frames()[i];
         let dt = frame.exposure_time as f32;
         let (channels, mask) = (self.looks[i].0, self.looks[i].1.as_ref().unwrap_or(&self.masks[i]));
-        let count = channels.count() as f32;
+        let noise = noise::of_mean_of(&self.curves_of_detail()[i], channels);
         let (seen, inside) = self.seen(latent, motion);
         let seen = seen.mean_of(channels);
         let exposure = self.exposures[i].mean_of(channels);
@@ -138,8 +85,7 @@ impl Run<'_> {
                 .map(|p| {
                     let m = mask.data[p];
                     // An operator is never true to better than some per cent of the structure around a pixel.
-                    let variance =
-                        self.noise.variance(f64::from(exposure.data[p])) as f32 / count / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
+                    let variance = noise::at(&noise, exposure.data[p]) / (dt * dt) + (MODEL_ERROR * local.data[p]).powi(2);
                     m * m / variance * inside.data[p]
                 })
                 .collect(),
@@ -148,57 +94,44 @@ impl Run<'_> {
         Luminances { latent: latent.mean_of(channels), seen, blurred: exposure.map(|v| v / dt), weight }
     }
 
-    /// TSF of frame `i` against the sharp irradiance, about where the frame lies, and what is known of it.
+    /// TSF of frame `i` against the sharp irradiance, about where the frame lies, what the report says of it, and what it says of whether the frame moved.
     pub(super) fn estimate(
         &self,
         i: usize,
         latent: &Rgb,
         how: impl Fn(&WholeFrame, &Search) -> Option<tsf::Estimate>,
-    ) -> (Option<Tsf>, Value) {
+    ) -> (Option<Tsf>, Value, Option<BlurEvidence>) {
         let base = self.base(i);
         let luminances = self.luminances(i, latent, &base);
         let frame = luminances.frame(base);
         let search = Search { model: self.settings.model, focal_px: self.settings.focal_px, stop: self.stop.clone() };
-        let Some(found) = how(&frame, &search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null) };
+        let Some(found) = how(&frame, &search).filter(tsf::Estimate::is_sound) else { return (None, Value::Null, None) };
         let detail = json!({
             "model": found.model,
             "focal_px": found.tsf.focal_px,
             "focal_length": found.focal,
             "models_tried": found.trials,
             "still_worse_by": found.still_worse_by,
+            "still_error": found.still_error,
             "blank_worse_by": found.blank_worse_by,
             "estimated_at_scale": found.scale,
             "extent_px": tsf::extent(&found.tsf, latent.width(), latent.height()),
             "residual": found.residual,
             "channels": self.looks[i].0.names(),
         });
-        (Some(found.tsf), detail)
+        let evidence = evidence(&found, latent.size());
+        (Some(found.tsf), detail, Some(evidence))
     }
 
-    /// Those of the frames `ids` whose blur seems long are looked at once more, as if it were slight: beside lamps far poses answer to what the sharp
-    /// frames lack, and a blur of a pixel or two passes for a long one. Whether any has another TSF now. `start`: irradiance before the frames counted.
-    pub(super) fn look_for_slight(
-        &mut self,
-        ids: &[usize],
-        start: &Rgb,
-        tsfs: &mut [Option<Tsf>],
-        details: &mut [Value],
-        fraction: f32,
-    ) -> Result<bool> {
-        let (w, h) = self.bracket.size();
-        let mut any = false;
-        for &i in ids {
-            if tsfs[i].as_ref().is_none_or(|t| tsf::extent(t, w, h) <= SLIGHT) {
-                continue;
-            }
-            self.progress(&format!("looking whether the blur of {} is slight", self.bracket.frames()[i].name), fraction)?;
-            let own = format!("slight {i} {:?} {:?}", self.settings.model, self.settings.focal_px);
-            let look = |run: &mut Self| Ok(run.estimate(i, start, |frame, search| frame.estimate_slight(search)));
-            if let (Some(tsf), detail) = self.remembered("blur", &own, |_| 0, look)? {
-                (tsfs[i], details[i], any) = (Some(tsf), detail, true);
-            }
-        }
-        Ok(any)
+    /// Whether each of the frames `ids` moved beside the irradiance `latent`, as motions in the image plane tell; `None` for one with too little texture to tell.
+    pub(super) fn looked_at(&self, ids: &[usize], latent: &Rgb) -> Vec<Option<BlurEvidence>> {
+        let search = Search { model: tsf::Model::Rigid, focal_px: self.settings.focal_px, stop: self.stop.clone() };
+        let frames: Vec<(DMat3, Luminances)> = ids.iter().map(|&i| (self.base(i), self.luminances(i, latent, &self.base(i)))).collect();
+        let look = |(base, luminances): &(DMat3, Luminances)| {
+            let found = luminances.frame(*base).estimates(&search, LOOKED_AT);
+            judge::strongest(found.iter().filter(|e| e.is_sound()).map(|e| evidence(e, latent.size())))
+        };
+        frames.par_iter().map(look).collect()
     }
 
     /// Patches of frame `i` and their PSFs, as the report has them.
@@ -230,6 +163,9 @@ impl Run<'_> {
             let path = tsf::path_at(tsf, p.centre(), (w, h));
             let reach = path.iter().map(|u| u.0.abs().max(u.1.abs())).max()? + PSF_MARGIN;
             let radius = wanted.map_or(reach, |r| r as isize);
+            if path.len() > LONGEST_PATH {
+                return None;
+            }
             let near = |x: isize, y: isize| path.iter().any(|u| (u.0 - x).abs() <= PSF_MARGIN && (u.1 - y).abs() <= PSF_MARGIN);
             Some((*p, psf::estimate_within(seen, 0, blurred, weight, p, radius as usize, &near)?))
         };

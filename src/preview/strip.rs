@@ -16,7 +16,7 @@ fn badge(state: &State, i: usize) -> Option<(String, Color32, String)> {
     }
     let solved = state.solved.as_ref()?;
     let frame = &solved.outcome.report["frames"][i];
-    let reason = frame["triage"]["reason"].as_str().unwrap_or_default().to_string();
+    let reason = frame["judgement"]["reason"].as_str().unwrap_or_default().to_string();
     if frame["used"] != true {
         let name = frame["frame"].as_str().unwrap_or_default();
         let why = solved.outcome.left_out.iter().find(|l| l.0 == name).map_or(reason, |l| l.1.clone());

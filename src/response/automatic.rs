@@ -3,9 +3,13 @@
 use super::Response;
 use super::calibrate::make_monotone;
 use super::displacement::displacements;
+use super::posterior::{Curve, posterior};
+use super::prior::{CurvePrior, basis};
 use super::shades::{self, Motion, Shade};
 use crate::error::{Error, Result};
-use crate::exposure::Bracket;
+use crate::exposure::{Bracket, Frame};
+use crate::image::Rgb;
+use crate::noise::{self, FrameNoise};
 use nalgebra::{Cholesky, DMatrix, DVector};
 use rayon::prelude::*;
 
@@ -15,6 +19,19 @@ pub struct Automatic {
     /// The curve.
     pub response: Response,
     /// How it was found, in words: which curve, from how many shades.
+    pub method: String,
+    /// Why it is less than a full curve, in words; `None` when it is one.
+    pub poor: Option<String>,
+    /// Standard deviation of the exposure at half of white's code, EV.
+    pub deviation_ev: f64,
+}
+
+/// A response measured from frames that show one scene without motion or blur.
+#[derive(Clone, Debug)]
+pub struct OfStillFrames {
+    /// The curve.
+    pub response: Response,
+    /// How it was found, in words.
     pub method: String,
     /// Why it is less than a full curve, in words; `None` when it is one.
     pub poor: Option<String>,
@@ -56,6 +73,8 @@ const WORTH_THREE: f64 = 0.1;
 const PRIOR: (f64, f64, f64) = (2.2, 2.0, 4.0);
 /// Smallest standard deviation of ln f⁻¹ of a shade: what lens and light change from frame to frame.
 const FLOOR: f64 = 0.01;
+/// By how much more likely a camera's curve has to be, natural logarithm of the density, for a bracket's files to be taken to note exposures that are off by far.
+const OTHERWISE: f64 = 4.0;
 /// Reweighting rounds against what moves.
 const ROUNDS: usize = 6;
 /// Standard deviation of the prior of ln Δt while exposure times are free: three EV.
@@ -68,22 +87,66 @@ const HELD: f64 = 1e-5;
 /// Blur and small shifts do not change the mean exposure of a block of pixels (1/45 of the frame's longer side, at least 8 px) whose neighbours
 /// are as bright. Block means z of all frames obey ln f⁻¹(z) = ln E + ln Δt, and with
 ///
-/// ln f⁻¹(z) = a ln z + Σ_k c_k (z^k − 1), k = 1..=K
+/// ln f⁻¹(z) = s ln sRGB⁻¹(z) + a ln z + Σ_k c_k (z^k − 1), k = 1..=5
 ///
-/// (a power law times the exponential of a polynomial: K = 0 is a gamma) that is linear in the unknowns. The weights are inverse variances
-/// (noise, and what the difference to the neighbouring blocks lets blur move in), times Cauchy weights against what moves. K from 0
-/// to 5, and one curve for all channels or one for each, are chosen by two-fold cross-validation. A curve to a
-/// power with all exposure ratios to the same power explains the frames as well (M. Grossberg and S. Nayar, "Determining the Camera Response from Images:
-/// What Is Knowable?", PAMI 2003): the exposure times decide.
-///
-/// With fewer than 120 shades only the exponent is estimated (S. Mann and R. Picard, "On being 'undigital' with digital cameras", 1995)
-/// and `poor` says so.
-///
-/// # Errors
-/// [`Error::Bracket`] when fewer than 12 blocks are well exposed in two frames of different exposure time, or no exponent from 0.4 to 6 explains
-/// them.
-pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
-    estimated(bracket, &Motion::Shaken(displacements(bracket.frames())))
+/// that is linear in the unknowns. One curve serves all channels; its prior is that of cameras' curves, exposures and white balance may differ from
+/// what the files note by what cameras' do, with a heavy tail. A curve to a power with all exposure ratios to the same power explains
+/// the frames as well (M. Grossberg and S. Nayar, "Determining the Camera Response from Images: What Is Knowable?", PAMI 2003): the priors decide. Where
+/// the frames tell nothing the prior's curve stands, and [`Automatic::deviation_ev`] says how wide it is.
+pub fn automatic(bracket: &Bracket) -> Automatic {
+    let frames = bracket.frames();
+    let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
+    let motion = Motion::Shaken(displacements(frames));
+    let prior = CurvePrior::of_cameras();
+    let mut curve = prior.middle();
+    let mut chosen = None;
+    // Means of exposures need the curve: begin with the prior's, then with the curve itself.
+    for _ in 0..2 {
+        let shades = shades::collect(frames, &motion, &|c, z| curve.inverse(c, z));
+        let telling = shades.iter().filter(|s| tells_ratio(s, &times)).count();
+        let noise = noise_under(frames, &curve);
+        // As the files note the exposures, and as the pixels have them under the curve as it is known: a file that notes something else bends the curve in vain.
+        let free = posterior(&shades, &times, &noise, &Curve::Known(&curve), None).map(|p| p.exposures);
+        let starts = [(None, 0.0), (free.as_deref(), OTHERWISE)];
+        let found = starts.into_iter().filter_map(|(start, more)| {
+            let found = posterior(&shades, &times, &noise, &Curve::Unknown(&prior), start)?;
+            Some((found.unlikely + more, found))
+        });
+        if let Some((_, found)) = found.min_by(|a, b| a.0.total_cmp(&b.0)) {
+            curve = super::prior::response(&found.coefficients);
+            chosen = Some((found.deviation, telling));
+        }
+    }
+    let (deviation, telling) = chosen.unwrap_or((f64::INFINITY, 0));
+    let deviation_ev = deviation / std::f64::consts::LN_2;
+    let method = format!("one curve for all channels under the prior of cameras' curves, from {telling} block means");
+    let poor = (telling < FEWEST).then(|| {
+        format!(
+            "{}: only {telling} blocks are well exposed in two frames of different exposure time: the curve is that of an average camera, its middle \
+             known to {deviation_ev:.1} EV",
+            frames[0].name
+        )
+    });
+    Automatic { response: curve, method, poor, deviation_ev }
+}
+
+/// Each frame's noise under the curve `response`.
+fn noise_under(frames: &[Frame], response: &Response) -> Vec<FrameNoise> {
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
+    noise::estimate(frames, &exposures, response)
+}
+
+/// By how many EV each frame of `bracket` was exposed more than its time says, and the standard deviation of that, as its pixels have it under a `response`
+/// that is known: aperture and ISO speed that changed, gain that a file does not note. Small next to the deviation where frames share too few shades.
+pub fn exposure_errors(bracket: &Bracket, response: &Response) -> Vec<(f64, f64)> {
+    let frames = bracket.frames();
+    let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
+    let shades = shades::collect(frames, &Motion::Shaken(displacements(frames)), &|c, z| response.inverse(c, z));
+    let ev = |v: &f64| v / std::f64::consts::LN_2;
+    match posterior(&shades, &times, &noise_under(frames, response), &Curve::Known(response), None) {
+        Some(found) => found.exposures.iter().map(ev).zip(found.deviations.iter().map(ev)).collect(),
+        None => vec![(0.0, f64::INFINITY); frames.len()],
+    }
 }
 
 /// The same from frames that show one scene without motion or blur, as a tripod gives them. Blocks down to 4 px count, beside clipped ones and beside
@@ -91,11 +154,11 @@ pub fn automatic(bracket: &Bracket) -> Result<Automatic> {
 ///
 /// # Errors
 /// Those of [`automatic`].
-pub fn of_still_frames(bracket: &Bracket) -> Result<Automatic> {
+pub fn of_still_frames(bracket: &Bracket) -> Result<OfStillFrames> {
     estimated(bracket, &Motion::None)
 }
 
-fn estimated(bracket: &Bracket, motion: &Motion) -> Result<Automatic> {
+fn estimated(bracket: &Bracket, motion: &Motion) -> Result<OfStillFrames> {
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
     let refuse = |why: String| {
@@ -144,7 +207,7 @@ fn estimated(bracket: &Bracket, motion: &Motion) -> Result<Automatic> {
             fit.curves.coefficients[0][0]
         )
     });
-    Ok(Automatic { response: fit.curves.response(), method, poor, exposures })
+    Ok(OfStillFrames { response: fit.curves.response(), method, poor, exposures })
 }
 
 /// Compares the exposure times of `bracket` with its pixels under a `response` that is known.
@@ -242,11 +305,6 @@ impl Curves {
             rises && (0.4..=6.0).contains(&middle) && (0.3..=8.0).contains(&self.coefficients[c][0])
         })
     }
-}
-
-/// ln z, z − 1, z² − 1, ...
-fn basis(z: f64, powers: usize) -> Vec<f64> {
-    std::iter::once(z.ln()).chain((1..=powers).map(|k| z.powi(k as i32) - 1.0)).collect()
 }
 
 fn tells_ratio(shade: &Shade, times: &[f64]) -> bool {

@@ -5,10 +5,14 @@ mod calibrate;
 mod displacement;
 mod file;
 mod mitsunaga;
+mod posterior;
+mod prior;
 mod reduce;
 mod shades;
 
-pub use automatic::{Automatic, DISAGREEMENT_EV, ExposureCheck, automatic, check_exposures, of_still_frames};
+pub use automatic::{
+    Automatic, DISAGREEMENT_EV, ExposureCheck, OfStillFrames, automatic, check_exposures, exposure_errors, of_still_frames,
+};
 pub use calibrate::calibrate;
 pub use file::{InverseTables, Provenance, ResponseFile};
 pub use mitsunaga::{Polynomial, mitsunaga};

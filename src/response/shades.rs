@@ -22,7 +22,7 @@ const DISPLACEMENT: f64 = 0.4;
 /// Shades are told apart in so many steps of intensity, for their weights.
 const CELLS: f64 = 32.0;
 /// So many blocks of one shade count in full.
-const CROWD: f64 = 20.0;
+pub(super) const CROWD: f64 = 20.0;
 /// And so many blocks of one shade are kept.
 const KEPT: usize = 12;
 /// Standard deviation of the mean intensity of a block in which nothing moves (noise, compression): one code and a half of 255.

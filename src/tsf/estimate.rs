@@ -65,6 +65,8 @@ pub struct Estimate {
     pub trials: Vec<Trial>,
     /// How much worse than the best of them it explains the frame that it did not move while it was exposed, in the same measure.
     pub still_worse_by: f64,
+    /// Standard error of that.
+    pub still_error: f64,
     /// The same of the frame showing nothing at all, no structure: of a frame of another scene about 0, as no blur explains parts that it was not fitted to.
     pub blank_worse_by: f64,
     /// Frame pixels per pixel of the finest level that the blur needed: 1, 2, 4, ...
@@ -342,6 +344,19 @@ fn main_path(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
 }
 
 impl WholeFrame<'_> {
+    /// [`WholeFrame::estimate`] of this frame and of it at 1/2, 1/4, ... of its size, `levels` sizes in all as far as they show anything: where the latent irradiance is
+    /// noisy, coarse structure tells more of a blur than fine. The TSFs are on this frame's pixels.
+    pub fn estimates(&self, search: &Search, levels: usize) -> Vec<Estimate> {
+        let (w, h) = self.size();
+        let fits = |l: &usize| *l == 0 || w.min(h) >> l >= SMALLEST;
+        let smaller = self.levels((0..levels).filter(fits).count().max(1) - 1);
+        let one = |l: usize| {
+            let found = if l == 0 { self.estimate(search) } else { smaller[l - 1].frame().estimate(search) }?;
+            Some(Estimate { tsf: found.tsf.scaled(f64::from(1u32 << l)), scale: found.scale << l, ..found })
+        };
+        (0..=smaller.len()).filter_map(one).collect()
+    }
+
     /// TSF of this frame from nothing; `None` when no pose explains it better than none.
     pub fn estimate(&self, search: &Search) -> Option<Estimate> {
         let (w, h) = self.size();
@@ -502,14 +517,26 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         attempt(search.model, focal)
     };
     let still = fit(&held.inside, Model::Rigid, focal, &Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose"), TRIAL);
-    let worse_by = |residual: &[f32]| Worse::than(&held.blocks(residual), &best).by;
-    let (still_worse_by, blank_worse_by) = (worse_by(&judge.residual(&still)), worse_by(judge.targets()));
+    let worse = |residual: &[f32]| Worse::than(&held.blocks(residual), &best);
+    let (than_still, blank_worse_by) = (worse(&judge.residual(&still)), worse(judge.targets()).by);
+    let (still_worse_by, still_error) = (than_still.by, than_still.error());
     let here = fit(&all, model, chosen_focal, &start, 10);
     let evidence = Evidence::new(frame, &all);
     let residual = evidence.misfit(&here);
     let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
     let evidence = (mean_square(evidence.targets()) - residual) * all.len() as f64 / numbers as f64;
-    Estimate { tsf: filled(&here, scale), model, focal: source, trials, still_worse_by, blank_worse_by, scale: 1 << l, residual, evidence }
+    Estimate {
+        tsf: filled(&here, scale),
+        model,
+        focal: source,
+        trials,
+        still_worse_by,
+        still_error,
+        blank_worse_by,
+        scale: 1 << l,
+        residual,
+        evidence,
+    }
 }
 
 /// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.
@@ -590,6 +617,11 @@ impl Worse {
         let mean = ratios.iter().sum::<f64>() / n;
         let variance = ratios.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0);
         Self { by: mean, errors: if variance > 0.0 { mean / (variance / n).sqrt() } else { 0.0 } }
+    }
+
+    /// Standard error of `by`.
+    fn error(self) -> f64 {
+        if self.errors == 0.0 { 0.0 } else { (self.by / self.errors).abs() }
     }
 
     /// Whether the simpler model may be taken all the same: less than a per cent is nothing, up to 8 % if it may be chance.

@@ -2,7 +2,7 @@
 
 use crate::oracle::blur as oracle;
 use crate::support::{assert_close, f64s, noise, uniform};
-use unshaken::blind::{self, Doubted, FittedTo, Frame, Lack, Look, Operator, PatchSetup, Stage, Start, fix_warp};
+use unshaken::blind::{self, FittedTo, Frame, Lack, Operator, PatchSetup, Stage, Start, fix_warp};
 use unshaken::image::Plane;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch, Psf};
@@ -18,10 +18,6 @@ fn path(n: usize, from: [f64; 3], to: [f64; 3], bend: f64) -> Tsf {
         })
         .collect();
     Tsf::new(150.0, poses).unwrap()
-}
-
-fn all_moved() -> Doubted<'static> {
-    Doubted { frames: &[], at_most: 0.0 }
 }
 
 #[test]
@@ -156,7 +152,7 @@ fn scene_and_shakes_are_found_together() {
     let merged = mean(&frames);
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = 0.0;
-    let found = blind::estimate(&frames, &starts, None, &all_moved(), (&merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |s| {
         assert!(s.fraction >= last && s.fraction <= 1.001, "progress goes on: {last} to {}", s.fraction);
         last = s.fraction;
         true
@@ -193,8 +189,8 @@ fn behind_lens(hard: &Plane, sigma: f32) -> Plane {
     })
 }
 
-/// All frames behind a lens of 0.8 px: without one of its own the estimate would have a harder scene and TSFs that are thicker by it, and explain the frames less
-/// well.
+/// All frames behind a lens of 0.8 px: without one of its own the estimate would have a harder scene and TSFs that are thicker by it, and
+/// explain the frames less well.
 #[test]
 fn what_a_lens_does_is_no_motion() {
     let hard = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
@@ -203,7 +199,7 @@ fn what_a_lens_does_is_no_motion() {
     let found = |latent: &Plane| {
         let frames = frames(latent, &tsfs);
         let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
-        let found = blind::estimate(&frames, &starts, None, &all_moved(), (&mean(&frames), &still()), &mut |_| true).unwrap();
+        let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| true).unwrap();
         let truth = latent.crop(PAD, PAD, SIZE.0, SIZE.1);
         let off = difference(&found.luminance, &truth) / difference(&frames[0].blurred, &truth);
         let thicker: Vec<f64> = found.tsfs.iter().zip(&tsfs).map(|(f, t)| spread(f) - spread(t)).collect();
@@ -226,7 +222,7 @@ fn of_two_starts_the_one_that_explains_more_goes_on() {
     let residual = |references: &[usize]| {
         let starts: Vec<Start> =
             references.iter().map(|&reference| Start { reference, luminance: frames[reference].blurred.clone() }).collect();
-        let found = blind::estimate(&frames, &starts, None, &all_moved(), (&merged, &still()), &mut |_| true).unwrap();
+        let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |_| true).unwrap();
         (found.reference, blind::geometric_mean(&found.held_out))
     };
     let alone = [residual(&[0]), residual(&[2])];
@@ -242,19 +238,10 @@ fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
     let merged = mean(&frames);
-    let found = blind::estimate(
-        &frames,
-        &[Start { reference: 0, luminance: merged.clone() }],
-        None,
-        &Doubted { frames: &[0, 1], at_most: 1.5 },
-        (&merged, &still()),
-        &mut |_| true,
-    )
-    .unwrap();
+    let found = blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], (&merged, &still()), &mut |_| true).unwrap();
     for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
         assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
     }
-    assert!(found.if_still < 1.5, "held still they are explained as well: {}", found.if_still);
 }
 
 /// A frame of more than 250 px has a second level.
@@ -265,7 +252,7 @@ fn cross_validated_tsfs_explain_pixels_that_were_not_seen_better() {
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let merged = &frames[1].blurred;
     let mut last = Stage { scale: 2, fraction: 0.0 };
-    let found = blind::estimate(&frames, &starts, None, &all_moved(), (merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, (merged, &still()), &mut |s| {
         assert!(s.fraction > last.fraction && s.scale <= last.scale, "progress goes on: {last:?} to {s:?}");
         last = s;
         true
@@ -283,194 +270,8 @@ fn cross_validated_tsfs_explain_pixels_that_were_not_seen_better() {
     // The second level is the last one here.
     let end = blind::geometric_mean(&found.held_out);
     assert!((end - best.held_out).abs() < 1e-9 * end, "{:?} and in the end {end}", found.ways);
-    let doubted = Doubted { frames: &[0, 1], at_most: 1.5 };
-    let asked = blind::estimate(&frames, &starts, None, &doubted, (merged, &still()), &mut |_| true).unwrap();
-    assert!(asked.if_still > 3.0, "held still they are not explained: {}", asked.if_still);
-    assert_eq!(asked.held_out, found.held_out, "what is asked changes nothing else");
-    assert_eq!(asked.ways, found.ways);
     let merge = blind::geometric_mean(&found.held_out_merge);
     assert!(end < 0.25 * merge, "{end}, the merge {merge}");
-}
-
-#[test]
-fn frames_that_stood_still_end_the_estimate() {
-    let size = (264, 48);
-    let hard = tiles(size.0 + 2 * PAD, size.1 + 2 * PAD);
-    let mut tsfs = shakes();
-    (tsfs[0], tsfs[1]) = (Tsf::identity(), Tsf::identity());
-    let frames = frames_of(size, &hard, &tsfs, 50);
-    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
-    let asked = |at_most: f64| {
-        let mut rounds = 0;
-        let doubted = Doubted { frames: &[0, 1], at_most };
-        let found = blind::estimate(&frames, &starts, None, &doubted, (&frames[0].blurred, &still()), &mut |_| {
-            rounds += 1;
-            true
-        });
-        (found.unwrap(), rounds)
-    };
-    let ((soon, few), (late, many)) = (asked(1.5), asked(0.0));
-    assert!(
-        soon.if_still < 1.5 && late.if_still == soon.if_still,
-        "held still they are explained as well: {}, {}",
-        soon.if_still,
-        late.if_still
-    );
-    assert!(soon.ways.is_empty() && late.ways.len() == 3 && 2 * few < many, "{few} rounds and {many}");
-}
-
-#[test]
-fn a_look_that_was_taken_serves_the_estimate() {
-    let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
-    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
-    let merged = mean(&frames);
-    let look = Look::at(&frames, &starts, &mut |_| true).unwrap();
-    let extents = look.extents();
-    let mut rounds = 0;
-    let mut estimate = |look: Option<Look>| {
-        rounds = 0;
-        let found = blind::estimate(&frames, &starts, look, &all_moved(), (&merged, &still()), &mut |_| {
-            rounds += 1;
-            true
-        });
-        (found.unwrap(), rounds)
-    };
-    let ((again, some), (whole, all)) = (estimate(Some(look)), estimate(None));
-    assert!(some < all, "{some} rounds after the look, {all} without");
-    assert_eq!(again.luminance.data, whole.luminance.data);
-    assert_eq!(again.held_out, whole.held_out);
-    let found: Vec<f64> = whole.tsfs.iter().map(|t| tsf::extent(t, SIZE.0, SIZE.1)).collect();
-    assert!(whole.ways.len() == 3, "all is tried on the one level that there is: {:?}", whole.ways);
-    assert!(extents.iter().zip(&found).all(|(a, b)| (a - b).abs() < 2.0), "{extents:.2?}, then {found:.2?}");
-}
-
-/// A lens that is soft leaves edges as soft as shake does; what the frames have in common is no motion of any. Frames as small as these tell so little
-/// that a growth doubles or halves from one draw of their noise to another, or by rounding alone: its median over draws counts.
-#[test]
-fn frames_that_stood_still_are_told_from_shaken_ones() {
-    let hard = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
-    let soft = hard.box_sum(1).box_sum(1).map(|v| v / 81.0);
-    let place = |x, y, roll| Tsf::new(150.0, vec![Pose::planar(x, y, roll, 1.0)]).unwrap();
-    let shaken = shakes();
-    let measured = [50, 60, 70, 80, 90].map(|seed| {
-        let look = |tsfs: &[Tsf]| {
-            let frames = frames_of(SIZE, &soft, tsfs, seed);
-            Look::at(&frames, &[Start { reference: 0, luminance: frames[0].blurred.clone() }], &mut |_| true).unwrap()
-        };
-        let displaced = look(&[Tsf::identity(), place(1.4, -2.6, 0.3), shaken[2].clone()]);
-        let moved = look(&shaken);
-        let one = look(&[Tsf::identity(), shaken[1].clone(), shaken[2].clone()]);
-        let still = [displaced.if_still(&[0, 1]), displaced.if_still(&[0]), one.if_still(&[0])];
-        let shaken = [displaced.if_still(&[0, 2]), moved.if_still(&[0, 1]), moved.if_still(&[0]), one.if_still(&[0, 1])];
-        println!("{still:.2?} {shaken:.2?}, {:.2?}", displaced.extents());
-        (still, shaken)
-    });
-    let median = |mut growth: [f64; 5]| {
-        growth.sort_by(f64::total_cmp);
-        growth[2]
-    };
-    let still: Vec<f64> = (0..3).map(|k| median(measured.map(|(still, _)| still[k]))).collect();
-    let shaken: Vec<f64> = (0..4).map(|k| median(measured.map(|(_, shaken)| shaken[k]))).collect();
-    assert!(still.iter().all(|g| *g < 1.5), "frames that stood still: {still:.2?}");
-    assert!(shaken.iter().all(|g| *g > 2.0), "shaken ones among them: {shaken:.2?}");
-}
-
-/// One frame stood still behind a soft lens: motion explains the frames better than a scene without a lens does, and no better than one with it.
-#[test]
-fn a_frame_that_stood_still_behind_a_soft_lens_is_told_by_the_lens() {
-    let hard = texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
-    let shaken = shakes();
-    let look = |latent: &Plane, tsfs: &[Tsf]| {
-        let frames = frames(latent, tsfs);
-        Look::at(&frames, &[Start { reference: 0, luminance: frames[0].blurred.clone() }], &mut |_| true).unwrap()
-    };
-    let soft = behind_lens(&hard, 0.9);
-    let one_stood = [Tsf::identity(), shaken[0].clone(), shaken[1].clone()];
-    let (stood, moved, no_lens) = (look(&soft, &one_stood), look(&soft, &shaken), look(&hard, &one_stood));
-    let of = |look: &Look, still: &[usize]| (look.if_still(still), look.if_still_behind_lens(still));
-    let (stood, moved, no_lens) = (of(&stood, &[0]), of(&moved, &[0, 1]), of(&no_lens, &[0]));
-    println!("stood {stood:.2?}, moved {moved:.2?}, no lens {no_lens:.2?}");
-    assert!(stood.1.is_some_and(|growth| growth < 1.2 && growth < stood.0 - 0.2), "{stood:.2?}");
-    assert!(moved.1.is_some_and(|growth| growth > 1.5), "{moved:.2?}");
-    assert_eq!(no_lens.1, None, "hard edges are behind no lens");
-}
-
-/// Behind the lens that the joint estimate finds, the frame that stood still can be held, the others cannot.
-#[test]
-fn the_frame_that_stood_still_can_be_held_behind_the_lens_that_was_found() {
-    let soft = behind_lens(&texture(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), 0.9);
-    let shaken = shakes();
-    let frames = frames(&soft, &[Tsf::identity(), shaken[0].clone(), shaken[1].clone()]);
-    let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
-    let found = blind::estimate(&frames, &starts, None, &all_moved(), (&mean(&frames), &still()), &mut |_| true).unwrap();
-    let growth: Vec<f64> = (0..3).map(|k| found.if_held(&[k])).collect();
-    println!("lens {} px, growth {growth:.2?}", found.lens_px);
-    assert!(found.lens_px > 0.5, "{} px", found.lens_px);
-    assert!(growth[0] < 1.15, "it stood: {growth:.2?}");
-    assert!(growth[1] > 1.4 && growth[2] > 1.4, "they moved: {growth:.2?}");
-}
-
-/// Two frames taken for sharp beside one shaken by some pixels: a slight motion of both is found, and none where there was none.
-#[test]
-fn frames_set_free_move_if_they_did() {
-    let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
-    let long = shakes().swap_remove(2);
-    let place = |x, y| Tsf::still(glam::DMat3::from_translation(glam::DVec2::new(x, y)));
-    let freed = |tsfs: &[Tsf], known: &[Tsf]| {
-        let frames = frames(&latent, tsfs);
-        blind::freed(&frames, &frames[0].blurred, known, &[0, 1], 0, &mut |_| true).unwrap()
-    };
-    let slight = [path(7, [-1.1, 0.2, -0.2], [1.1, -0.2, 0.2], 0.3), path(7, [0.2, -1.2, 0.2], [-0.1, 1.1, -0.1], -0.3)];
-    let moved = freed(&[slight[0].clone(), slight[1].clone(), long.clone()], &[Tsf::identity(), Tsf::identity(), long.clone()]);
-    let placed = [Tsf::identity(), place(9.0, -7.0), long.clone()];
-    let stood = freed(&placed, &placed);
-    // About its own place, a displaced frame moves as one in place does.
-    let apart = slight[1].clone().about(place(9.0, -7.0).base);
-    let both = freed(&[slight[0].clone(), apart.clone(), long.clone()], &placed);
-    let error = |found: &blind::Freed| difference(&found.luminance, &latent.crop(PAD, PAD, SIZE.0, SIZE.1));
-    println!(
-        "moved {:.2} {:.2?} {:.3}, stood {:.2} {:.2?} {:.3}, both {:.2} {:.2?} {:.3}",
-        moved.left,
-        moved.extents,
-        error(&moved),
-        stood.left,
-        stood.extents,
-        error(&stood),
-        both.left,
-        both.extents,
-        error(&both)
-    );
-    assert!(stood.extents[..2].iter().all(|e| *e < 1.0), "moved by {:.2?} px where nothing moved", stood.extents);
-    // A lens that is soft in all directions alike, its scene without the smoothness that is asked of scenes: blur, but none that tells the frames apart.
-    let lens = |base: &Tsf| {
-        let around = [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (0.0, 0.0)].map(|(x, y)| Pose::planar(x, y, 0.0, 0.2));
-        Tsf::new(150.0, around.to_vec()).unwrap().about(base.base)
-    };
-    let soft = freed(&[lens(&placed[0]), lens(&placed[1]), long.clone()], &placed);
-    println!(
-        "unlike {:.2} {:.2}, {:.2} behind a lens of {:.2?} px; if still {:.2} {:.2}, {:.2}",
-        moved.unlike,
-        both.unlike,
-        soft.unlike,
-        soft.extents,
-        moved.if_still(),
-        both.if_still(),
-        soft.if_still()
-    );
-    assert!(soft.left < 0.6 && soft.extents[..2].iter().all(|e| *e > 1.0), "{:.2} left, {:.2?} px", soft.left, soft.extents);
-    assert!(soft.unlike < 0.12 && moved.unlike > 0.3 && both.unlike > 0.3, "{:.2}, {:.2} {:.2}", soft.unlike, moved.unlike, both.unlike);
-    assert!(moved.if_still() > 1.2 && both.if_still() > 1.2, "{:.2} {:.2}", moved.if_still(), both.if_still());
-    for found in [&moved, &both] {
-        assert!(found.left < 0.6, "{:.2} left", found.left);
-        for (k, tsf) in slight.iter().enumerate() {
-            let (e, truth) = (found.extents[k], tsf::extent(tsf, SIZE.0, SIZE.1));
-            assert!((e - truth).abs() < 1.2, "frame {k} moved by {e:.2} px, in truth {truth:.2}");
-        }
-    }
-    let mean = both.tsfs[0].mean();
-    assert!(mean.t_x.hypot(mean.t_y) < 0.05, "the reference rests: {mean:?}");
-    let lies = tsf::Tsf::centre(&both.tsfs[1]).z_axis;
-    assert!((lies.x - 9.0).hypot(lies.y + 7.0) < 0.5, "the other one stays where it lies: {lies}");
 }
 
 #[test]
@@ -478,7 +279,7 @@ fn the_joint_estimate_can_be_cancelled() {
     let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut calls = 0;
-    let found = blind::estimate(&frames, &starts, None, &all_moved(), (&mean(&frames), &still()), &mut |_| {
+    let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| {
         calls += 1;
         calls < 2
     });
@@ -502,8 +303,8 @@ fn centred(p: &Patch, size: (usize, usize)) -> glam::DVec2 {
     glam::DVec2::new(c.0 - (size.0 as f64 - 1.0) / 2.0, c.1 - (size.1 as f64 - 1.0) / 2.0)
 }
 
-/// What is left of `shifts` once the shift and the small rotation of all that explain most of them are taken off, pixels: neither changes what a
-/// TSF can explain.
+/// What is left of `shifts` once the shift and the small rotation of all that explain most of them are taken off, pixels: neither changes
+/// what a TSF can explain.
 fn left_over(shifts: &[(f64, f64)], places: &[glam::DVec2]) -> f64 {
     let n = shifts.len() as f64;
     let mean = shifts.iter().fold(glam::DVec2::ZERO, |s, v| s + glam::DVec2::new(v.0, v.1)) / n;

@@ -68,9 +68,10 @@ fn photographed(
 
 fn shares(frames: &[Frame], motions: &[DMat3]) -> Vec<Option<Plane>> {
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
-    let curves = noise::curves(frames, &Response::Linear, &NOISE);
+    let level = noise::alike(frames.len(), NOISE);
+    let curves = noise::curves(frames, &Response::Linear, &level);
     let ids: Vec<usize> = (0..frames.len()).collect();
-    Sharp { frames, exposures: &exposures, curves: &curves, noise: &NOISE, motions, ids: &ids }.shares()
+    Sharp { frames, exposures: &exposures, curves: &curves, noise: &level, motions, ids: &ids }.shares()
 }
 
 fn displaced() -> [DMat3; 3] {
@@ -193,9 +194,9 @@ fn what_stands_still_is_no_ghost() {
     let motions = [(0.0, 0.0, 0.0), (3.5, -5.5, 0.5), (-7.7, 2.45, -0.4)].map(|(x, y, z)| Pose::planar(x, y, z, 1.0).homography(1000.0));
     let frames = made.bracket.frames();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Srgb)).collect();
-    let model = NoiseModel::from_electrons(4000.0, 8.0);
-    let curves = noise::curves(frames, &Response::Srgb, &model);
-    let found = Sharp { frames, exposures: &exposures, curves: &curves, noise: &model, motions: &motions, ids: &[0, 1, 2] }.shares();
+    let level = noise::alike(frames.len(), NoiseModel::from_electrons(4000.0, 8.0));
+    let curves = noise::curves(frames, &Response::Srgb, &level);
+    let found = Sharp { frames, exposures: &exposures, curves: &curves, noise: &level, motions: &motions, ids: &[0, 1, 2] }.shares();
     assert!(found.iter().all(Option::is_none));
 }
 
@@ -213,9 +214,10 @@ fn frames_of_any_size_are_compared() {
         };
         let frames = [frame(1.0), frame(2.0)];
         let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
-        let curves = noise::curves(&frames, &Response::Linear, &NOISE);
+        let level = noise::alike(frames.len(), NOISE);
+        let curves = noise::curves(&frames, &Response::Linear, &level);
         let motions = [DMat3::IDENTITY, DMat3::from_translation(DVec2::new(0.3, 0.1))];
-        let sharp = Sharp { frames: &frames, exposures: &exposures, curves: &curves, noise: &NOISE, motions: &motions, ids: &[0, 1] };
+        let sharp = Sharp { frames: &frames, exposures: &exposures, curves: &curves, noise: &level, motions: &motions, ids: &[0, 1] };
         assert!(sharp.shares().iter().all(Option::is_none), "{w} x {h}");
     }
 }

@@ -20,17 +20,17 @@ const TABLE: Table = &[
     ("nonnegative", &[]),
     ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
-    ("response", &["error", "image", "exposure", "mask"]),
-    ("noise", &["error", "image", "exposure", "response", "pose::project", "sampling", "kernels::NOISE_STEPS"]),
-    ("mask", &["error", "image", "exposure", "pose"]),
+    ("response", &["error", "image", "exposure", "mask::CLIPPED", "noise"]),
+    ("noise", &["image", "exposure", "response::Response", "kernels::NOISE_STEPS"]),
+    ("photometry", &["image::Rgb", "exposure::Frame", "mask::CLIPPED", "noise::FrameNoise", "pose::project"]),
+    ("mask", &["image", "exposure", "pose"]),
     ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),
-    ("merge", &["error", "image", "exposure", "mask", "noise", "pose", "kernels::NOISE_STEPS"]),
+    ("merge", &["image", "exposure", "mask", "noise", "pose"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
     ("channels", &["image", "exposure", "mask", "merge", "noise"]),
-    ("register", &["error", "image", "pose", "exposure", "noise", "mask", "fft", "sampling"]),
-    ("triage", &["error", "image", "exposure", "noise", "mask", "pose"]),
-    ("psf", &["error", "image", "noise", "mask", "fft", "nonnegative"]),
-    ("tsf", &["error", "image", "pose", "psf", "noise", "mask", "fft", "nonnegative", "sampling"]),
+    ("register", &["image", "pose", "exposure", "noise", "mask", "fft", "sampling"]),
+    ("psf", &["image", "fft", "nonnegative"]),
+    ("tsf", &["error", "image", "pose", "psf", "fft", "nonnegative", "sampling"]),
     ("blind", &["image", "mask", "merge", "pose", "psf", "random", "sampling", "tsf"]),
     // The device, its operators, the solver.
     ("gpu", &["error"]),
@@ -47,12 +47,12 @@ const TABLE: Table = &[
             "exposure",
             "response",
             "noise",
+            "photometry",
             "channels",
             "ghosts",
             "mask",
             "merge",
             "register",
-            "triage",
             "psf",
             "tsf",
             "blind",
@@ -68,7 +68,7 @@ const TABLE: Table = &[
     // Colours.
     ("colour", &["image"]),
     // What a result rests on.
-    ("layers", &["image", "pose::nearest_pixel", "exposure", "response", "noise::NoiseModel", "mask::CLIPPED", "pipeline::Outcome"]),
+    ("layers", &["image", "pose::nearest_pixel", "exposure", "response", "mask::CLIPPED", "pipeline::Outcome"]),
     // Judges and pictures.
     ("metrics", &["error", "image"]),
     ("tonemap", &["error", "image"]),
@@ -403,7 +403,7 @@ fn a_wrong_import_is_found_however_it_is_written() {
     for (module, text) in [
         ("synth", "use crate::deblur::solve;"),
         ("synth", "use crate::tsf::estimate;"),
-        ("synth", "use crate::{image::Rgb, triage};"),
+        ("synth", "use crate::{image::Rgb, photometry};"),
         ("gpu", "use crate::{\n    error::Error,\n    image::{Plane, Rgb},\n};"),
         ("gpu", "fn f() { crate::kernels::channels(); }"),
         ("kernels", "use crate::tsf::{Interpolation, Tsf};"),
@@ -425,6 +425,20 @@ fn a_wrong_import_is_found_however_it_is_written() {
         ("main", "fn main() { unshaken::cli::main() }"),
     ] {
         assert_eq!(check(module, text), Vec::<String>::new(), "{module}: {text}");
+    }
+}
+
+/// Judgements are made of numbers: not of images, and not of what the rest of the pipeline has.
+#[test]
+fn judgements_know_nothing_but_numbers() {
+    let mut all = Vec::new();
+    sources(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/src/pipeline/judge")), Some("judge"), &mut all);
+    assert!(all.len() >= 2);
+    for (_, text) in all {
+        assert!(paths(&text, "crate::").is_empty(), "{:?}", paths(&text, "crate::"));
+        for path in paths(&text, "super::") {
+            assert!(["Judgement", "Kind", "*"].contains(&path.as_str()), "super::{path}");
+        }
     }
 }
 

@@ -43,6 +43,8 @@ mod metrics;
 mod page;
 /// Photographers' files: raw, notes, profiles, primaries; what results say of themselves.
 mod photo;
+/// Gain and black offset of each frame.
+mod photometry;
 /// Registration: motions planted in drawn scenes, what is refused.
 mod register;
 /// Response: calibration against truth and against OpenCV, response files.
@@ -53,7 +55,7 @@ mod scale;
 mod shaders;
 /// The solver against dense algebra, and what it promises.
 mod solver;
-/// Noise, masks, PSFs, TSFs and triage on input whose answer is planted.
+/// Noise, masks, PSFs and TSFs on input whose answer is planted.
 mod stages;
 /// Synthetic brackets against the physics that they claim.
 mod synth;

@@ -1,0 +1,64 @@
+//! What the frames are, decided from numbers alone: no image, no device, no report. Each judgement says what was compared, the line and the margin.
+
+mod blur;
+
+pub(super) use blur::{BlurEvidence, blurred, is_other_scene, strongest};
+
+use serde::Serialize;
+
+/// What a frame is taken for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Kind {
+    /// It was not moved while it was exposed.
+    Stationary,
+    /// It was.
+    Moved,
+    /// It shows something else, or nothing.
+    OtherScene,
+    /// The user left it out.
+    Excluded,
+}
+
+/// What was decided of a frame, and by how much.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Judgement {
+    pub kind: Kind,
+    /// What was compared: a quantity's name.
+    pub compared: &'static str,
+    /// Its value, the line that decides, and how far the value is on the side of the decision, in the same unit; `None` where the user decided.
+    pub value: Option<f64>,
+    pub line: Option<f64>,
+    pub margin: Option<f64>,
+    /// In words.
+    pub reason: String,
+}
+
+impl Judgement {
+    /// What the user said.
+    pub fn given(kind: Kind) -> Self {
+        let reason = match kind {
+            Kind::Stationary => "sharp by option",
+            Kind::Excluded => "left out",
+            _ => "blurred by option",
+        };
+        Self { kind, compared: "option", value: None, line: None, margin: None, reason: reason.into() }
+    }
+
+    /// The frame beside which the others are judged first.
+    pub fn anchor() -> Self {
+        let reason = "the shortest frame that shows enough; the others are judged beside it".into();
+        Self { kind: Kind::Stationary, compared: "exposure time", value: None, line: None, margin: None, reason }
+    }
+
+    /// Of a frame in which nothing tells whether it moved.
+    pub fn untold() -> Self {
+        let reason = "too little in it that the others show as well to tell whether it moved: its light counts where it lies".into();
+        Self { kind: Kind::Stationary, compared: "nothing", value: None, line: None, margin: None, reason }
+    }
+
+    /// By on which side of `line` the `value` is.
+    pub fn by(kind: Kind, compared: &'static str, value: f64, line: f64, reason: String) -> Self {
+        Self { kind, compared, value: Some(value), line: Some(line), margin: Some((value - line).abs()), reason }
+    }
+}

@@ -1,0 +1,487 @@
+//! The stages in order: places, what the frames are, blurs and irradiance in turn.
+
+use super::blind::{Blind, Found};
+use super::judge::{self, BlurEvidence, Judgement, Kind};
+use super::place::Placed;
+use super::shaken::{for_estimates, for_first_round};
+use super::{Outcome, Run};
+use crate::deblur::{self, Solution};
+use crate::error::Result;
+use crate::image::Rgb;
+use crate::tsf::{self, Tsf, TsfFile};
+use glam::DMat3;
+use serde_json::Value;
+
+/// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
+const ROUNDS: usize = 2;
+/// Outer iterations for stationary frames alone in one place. Where they are displaced they get as many as shaken ones: the start was resampled, which
+/// smooths, and the residual-driven weights come late.
+const STATIONARY_OUTER: usize = 3;
+
+/// What is known of a bracket while irradiance and blurs are looked for in turn.
+pub(super) struct State {
+    pub reference: usize,
+    pub judgements: Vec<Option<Judgement>>,
+    /// Frames that count as they lie.
+    pub still: Vec<usize>,
+    /// Frames that count by their blur.
+    pub shaken: Vec<usize>,
+    pub tsfs: Vec<Option<Tsf>>,
+    /// What the report says of each frame's blur.
+    pub details: Vec<Value>,
+    /// Whether a TSF was given.
+    given: Vec<bool>,
+    /// The irradiance as it is known.
+    latent: Option<Rgb>,
+    /// Whether the TSFs of all frames come from a smaller size than the frames'.
+    reduced: bool,
+    /// Whether a frame has joined the stationary ones since these were solved for.
+    joined: bool,
+}
+
+/// Why a frame is left out whose blur is looked for beside sharp ones that the user named.
+const NO_TEXTURE: &str = "too little texture that both it and the sharp frames see clearly to find its blur (a sharp frame with a longer exposure \
+                          time, or more detail where this frame is not clipped, would help)";
+
+impl State {
+    /// Frames that count.
+    pub fn all(&self) -> Vec<usize> {
+        self.still.iter().chain(&self.shaken).copied().collect()
+    }
+
+    fn count_as_it_lies(&mut self, i: usize) {
+        self.shaken.retain(|&k| k != i);
+        self.still.push(i);
+        self.still.sort_unstable();
+        (self.tsfs[i], self.details[i]) = (None, Value::Null);
+    }
+}
+
+impl Run<'_> {
+    pub(super) fn reconstruct(mut self, excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<Outcome> {
+        let mut state = self.begun(excluded, given)?;
+        self.find_all_blurs(&mut state, given.is_some())?;
+        let base = self.stationary_frames(&mut state)?;
+        if let Some(found) = &base {
+            state.latent = Some(found.cropped());
+        }
+        self.estimate_blurs(&mut state)?;
+        self.doubt_the_first(&mut state)?;
+        let base = self.base_again(&mut state, base)?;
+        let solution = match self.rounds(&mut state, base.as_ref())? {
+            Some(found) => found,
+            None => self.stationary_alone(&mut state, base)?,
+        };
+        self.progress("finishing", 0.99)?;
+        self.describe_blurs(&mut state)?;
+        self.finish(solution, state)
+    }
+
+    /// Places and judgements of the frames that are not `excluded`, and TSFs that were given.
+    fn begun(&mut self, excluded: Vec<bool>, given: Option<&TsfFile>) -> Result<State> {
+        let frames = self.bracket.frames();
+        let (n, (w, h)) = (frames.len(), self.bracket.size());
+        let used: Vec<usize> = (0..n).filter(|&i| !excluded[i]).collect();
+        let mut tsfs: Vec<Option<Tsf>> = vec![None; n];
+        if let Some(file) = given {
+            for &i in &used {
+                tsfs[i] = file.find(&frames[i].name, w, h)?;
+                match &tsfs[i] {
+                    Some(tsf) => self.motions[i] = tsf.centre(),
+                    None => self.warn(format!("{}: the TSF file does not hold it; its TSF is estimated", frames[i].name))?,
+                }
+            }
+        }
+        let known: Vec<bool> = tsfs.iter().map(Option::is_some).collect();
+        let settings = self.settings;
+        self.memo.depends(&(&settings.exclude, &settings.sharp, settings.reference, settings.align));
+        let placed = self.remembered("registration", "", |_| 0, |run| run.place(&used, &excluded, &known))?;
+        let Placed { excluded, motions, registrations, photometry, left_out, degraded } = placed;
+        (self.motions, self.registrations, self.left_out, self.degraded) = (motions, registrations, left_out, degraded);
+        if self.photometry != photometry {
+            // A remembered stage.
+            self.take_photometry(photometry);
+        }
+        self.memo.depends(&(settings.alpha, settings.deghost, settings.blind, settings.deblur.interpolation));
+        let doubtful = |i: usize| self.registrations[i].doubtful;
+        let used: Vec<usize> = used.into_iter().filter(|&i| !excluded[i] || doubtful(i)).collect();
+        let is = |list: &[usize], i: usize| if list.contains(&i) { Kind::Stationary } else { Kind::Moved };
+        let mut judgements: Vec<Option<Judgement>> = vec![None; n];
+        for &i in &used {
+            judgements[i] = match (&tsfs[i], &settings.sharp) {
+                (Some(tsf), _) if tsf.single().is_some() => Some(Judgement::given(Kind::Stationary)),
+                (Some(_), _) => Some(Judgement::given(Kind::Moved)),
+                (None, Some(list)) => Some(Judgement::given(is(list, i))),
+                (None, None) => None,
+            };
+        }
+        let stationary = |i: usize| judgements[i].as_ref().is_some_and(|j| j.kind == Kind::Stationary);
+        let still: Vec<usize> = used.iter().copied().filter(|&i| stationary(i)).collect();
+        let shaken: Vec<usize> = used.iter().copied().filter(|i| !still.contains(i)).collect();
+        for (i, judgement) in judgements.iter_mut().enumerate().filter(|(i, _)| !used.contains(i)) {
+            *judgement = Some(if settings.exclude.contains(&i) {
+                Judgement::given(Kind::Excluded)
+            } else {
+                Judgement { reason: self.registrations[i].reason.clone(), ..Judgement::given(Kind::OtherScene) }
+            });
+        }
+        Ok(State {
+            reference: 0,
+            judgements,
+            still,
+            shaken,
+            tsfs,
+            details: vec![Value::Null; n],
+            given: known,
+            latent: None,
+            reduced: false,
+            joined: false,
+        })
+    }
+
+    /// Where the user says so the TSFs of all frames and a scene to start from, without a look at which are stationary.
+    fn find_all_blurs(&mut self, state: &mut State, given: bool) -> Result<()> {
+        let used = state.all();
+        if used.iter().all(|&i| state.given[i]) {
+            if state.still.is_empty() {
+                state.latent = Some(self.timed("luminance", |run| run.start_from_tsfs(&used, &state.tsfs))?);
+            }
+            return Ok(());
+        }
+        let none_sharp = state.still.is_empty() && self.settings.sharp.is_some() && self.settings.blind != Blind::Off;
+        if given || !(none_sharp || matches!(self.settings.blind, Blind::Joint | Blind::Patches)) {
+            return Ok(());
+        }
+        self.take_all_blurs(state)?;
+        if state.latent.is_none() {
+            self.degrade("camera shake does not explain the frames if all of them moved: they are judged beside the shortest".into())?;
+        }
+        Ok(())
+    }
+
+    /// The joint estimate of all frames' TSFs, or the paper's, if it explains them.
+    fn take_all_blurs(&mut self, state: &mut State) -> Result<()> {
+        let used = state.all();
+        let (scene, tsfs) = (state.latent.take(), state.tsfs.clone());
+        let known = scene.as_ref().map(|scene| (scene, tsfs.as_slice()));
+        if self.settings.blind == Blind::Patches {
+            self.memo.depends(&(self.settings.psf_radius, self.settings.patch_size));
+        }
+        let (found, motions, blind, degraded) = self.remembered(
+            "all blurs",
+            "",
+            |_| 0,
+            |run| {
+                let found = if run.settings.blind == Blind::Patches {
+                    run.patches(&used, 0.03, 0.60)?
+                } else {
+                    run.joint(&used, known, 0.03, 0.60)?
+                };
+                Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
+            },
+        )?;
+        (self.blind, self.degraded) = (blind, degraded);
+        if let Some(Found { start, tsfs, reference, reduced }) = found {
+            self.motions = motions;
+            for (&i, tsf) in used.iter().zip(tsfs) {
+                state.tsfs[i] = Some(tsf);
+                state.judgements[i] = Some(Judgement {
+                    reason: "no frame is sharp: all blurs were estimated together".into(),
+                    ..Judgement::given(Kind::Moved)
+                });
+            }
+            (state.still, state.shaken, state.reference) = (Vec::new(), used, reference);
+            (state.latent, state.reduced) = (Some(start), reduced);
+        } else {
+            state.latent = scene;
+        }
+        Ok(())
+    }
+
+    /// Where all others moved beside the first frame and its own edges are soft, it may have moved as well: the joint estimate of all blurs, if that explains held-out pixels better.
+    fn doubt_the_first(&mut self, state: &mut State) -> Result<()> {
+        let [first] = state.still[..] else { return Ok(()) };
+        let asked = self.settings.blind == Blind::Auto && self.settings.sharp.is_none() && !state.given.contains(&true);
+        if asked && !state.shaken.is_empty() && state.shaken.iter().all(|&i| state.tsfs[i].is_some()) && self.is_soft(first) {
+            self.take_all_blurs(state)?;
+            if state.still.is_empty() {
+                self.lay_out(state)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Reference, places, ghosts and masks of the frames as `state` has them.
+    fn lay_out(&mut self, state: &mut State) -> Result<()> {
+        let all = state.all();
+        if state.latent.is_none() {
+            let longest = self.bracket.longest(&state.still);
+            state.reference = self.settings.reference.or(longest).or_else(|| self.bracket.shortest(&all)).unwrap_or(0);
+            if state.given.iter().all(|k| !k) {
+                self.rebase(state.reference);
+            }
+        } else {
+            state.reference = self.settings.reference.unwrap_or(state.reference);
+            for (motion, tsf) in self.motions.iter_mut().zip(&state.tsfs) {
+                *motion = tsf.as_ref().map_or(*motion, Tsf::centre);
+            }
+        }
+        self.scale = self.bracket.frames()[state.reference].exposure_time;
+        self.find_ghosts(&state.still)?;
+        let sharp: Vec<bool> = (0..self.bracket.frames().len()).map(|i| state.still.contains(&i)).collect();
+        self.weigh(&sharp, &all);
+        Ok(())
+    }
+
+    /// Which frames are stationary, and what they show. The shortest frame that shows enough is the first; each other one is stationary unless a motion explains it
+    /// better than none beside what that shows; and the first one has to stand the same beside the others that do. `None` where another scene is known.
+    fn stationary_frames(&mut self, state: &mut State) -> Result<Option<Solution>> {
+        if state.latent.is_some() {
+            self.lay_out(state)?;
+            return Ok(None);
+        }
+        if !state.still.is_empty() {
+            return self.solve_base(state).map(Some);
+        }
+        let used = state.all();
+        let placed: Vec<usize> = used.iter().copied().filter(|&i| !self.registrations[i].doubtful).collect();
+        let anchor = self.first_reference(&placed).unwrap_or(used[0]);
+        let own = format!("{used:?}");
+        let (judgements, still, motions, registrations) = self.remembered(
+            "stationary frames",
+            &own,
+            |_| 0,
+            |run| {
+                let judged = run.judge_beside(state, anchor, &placed)?;
+                Ok((judged.0, judged.1, run.motions.clone(), run.registrations.clone()))
+            },
+        )?;
+        (self.motions, self.registrations) = (motions, registrations);
+        (state.judgements, state.still) = (judgements, still);
+        state.shaken = used.into_iter().filter(|i| !state.still.contains(i)).collect();
+        self.solve_base(state).map(Some)
+    }
+
+    /// Judgements of the frames `placed` beside `anchor`, and those that are stationary.
+    fn judge_beside(&mut self, state: &mut State, anchor: usize, placed: &[usize]) -> Result<(Vec<Option<Judgement>>, Vec<usize>)> {
+        let others: Vec<usize> = placed.iter().copied().filter(|&i| i != anchor).collect();
+        state.judgements[anchor] = Some(Judgement::anchor());
+        (state.still, state.shaken) = (vec![anchor], others.clone());
+        let scene = self.solve_base(state)?.cropped();
+        self.progress("looking which frames moved", 0.08)?;
+        for (&i, found) in others.iter().zip(self.looked_at(&others, &scene)) {
+            // Nothing in it tells that it moved: its light counts where it lies.
+            state.judgements[i] = Some(found.map_or_else(Judgement::untold, |e| judge::blurred(&e)));
+        }
+        let is = |state: &State, i: usize| state.judgements[i].as_ref().is_some_and(|j| j.kind == Kind::Stationary);
+        let joined: Vec<usize> = others.iter().copied().filter(|&i| is(state, i)).collect();
+        if joined.is_empty() {
+            return Ok((state.judgements.clone(), vec![anchor]));
+        }
+        self.place_stationary(state, &joined)?;
+        // The other way round: what does the first frame look like beside those?
+        (state.still, state.shaken) = (joined.clone(), others.iter().copied().filter(|i| !joined.contains(i)).chain([anchor]).collect());
+        let scene = self.solve_base(state)?.cropped();
+        if let Some(e) = self.looked_at(&[anchor], &scene).remove(0) {
+            let judgement = judge::blurred(&e);
+            if judgement.kind == Kind::Moved {
+                state.judgements[anchor] = Some(judgement);
+                return Ok((state.judgements.clone(), joined));
+            }
+        }
+        state.still.push(anchor);
+        state.still.sort_unstable();
+        state.shaken.retain(|&i| i != anchor);
+        Ok((state.judgements.clone(), state.still.clone()))
+    }
+
+    /// What the stationary frames show: masks, ghosts and their solution.
+    fn solve_base(&mut self, state: &mut State) -> Result<Solution> {
+        self.lay_out(state)?;
+        let settings = self.stationary_settings(state);
+        let settings = if state.shaken.is_empty() { settings } else { for_estimates(&settings) };
+        let own = format!("{:?} {:?}", state.still, state.shaken);
+        let solved = self.solved("stationary frames", &own, &settings, |run| run.solve_stationary(state, None, &settings, (0.05, 0.10)))?;
+        Ok(solved)
+    }
+
+    /// What the stationary frames show once it is final which these are: `base`, unless one joined them since.
+    fn base_again(&mut self, state: &mut State, base: Option<Solution>) -> Result<Option<Solution>> {
+        let Some(base) = base.filter(|_| !state.still.is_empty()) else { return Ok(None) };
+        let base = if state.joined { self.solve_base(state)? } else { base };
+        state.latent = Some(base.cropped());
+        Ok(Some(base))
+    }
+
+    fn stationary_settings(&self, state: &State) -> deblur::Settings {
+        let displaced = state.still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+        let outer = if displaced { self.settings.deblur.outer } else { STATIONARY_OUTER };
+        deblur::Settings { outer, ..self.settings.deblur.clone() }
+    }
+
+    /// The stationary frames alone, from `start` or their merge.
+    fn solve_stationary(
+        &mut self,
+        state: &State,
+        start: Option<&Solution>,
+        settings: &deblur::Settings,
+        at: (f32, f32),
+    ) -> Result<Solution> {
+        self.progress("merging the sharp frames", at.0)?;
+        let placed: Vec<Option<Tsf>> = self.motions.iter().map(|m| Some(Tsf::still(*m))).collect();
+        let pad = self.pad(state.still.iter().filter_map(|&i| placed[i].as_ref()));
+        let initial = match start {
+            Some(found) => self.surrounded(&found.irradiance, found.pad, pad, &state.still, &state.shaken),
+            None => self.surrounded(&self.start(&state.still, 0).0, 0, pad, &state.still, &state.shaken),
+        };
+        self.solve(&state.still, &placed, &initial, pad, settings, at.0, at.1)
+    }
+
+    /// The result where no shaken frame counts: the stationary ones, what they show between the pixels taken off.
+    fn stationary_alone(&mut self, state: &mut State, base: Option<Solution>) -> Result<Solution> {
+        let latent = state.latent.clone().expect("a scene is known by now");
+        self.find_aliasing(&state.still, &state.shaken, &latent, 0.80, 0.90)?;
+        let settings = self.stationary_settings(state);
+        let own = format!("alone {:?}", state.still);
+        self.solved("stationary frames", &own, &settings, |run| run.solve_stationary(state, base.as_ref(), &settings, (0.90, 0.98)))
+    }
+
+    /// TSFs of the shaken frames of which none is known, beside what the stationary ones show. A frame of which no motion is found
+    /// joins these; one of another scene, or whose blur cannot be told where the user named the sharp frames, is left out.
+    fn estimate_blurs(&mut self, state: &mut State) -> Result<()> {
+        if state.still.is_empty() {
+            return Ok(());
+        }
+        let estimated: Vec<usize> = state.shaken.iter().copied().filter(|&i| !state.given[i]).collect();
+        let may_join = self.settings.align && self.settings.sharp.is_none();
+        let mut joined = Vec::new();
+        let latent = state.latent.clone().expect("what the stationary frames show");
+        for (k, &i) in estimated.iter().enumerate() {
+            let part = k as f32 / estimated.len() as f32;
+            self.progress(&format!("estimating the blur of {}", self.bracket.frames()[i].name), 0.10 + 0.30 * part)?;
+            let own = format!("{i} {:?} {:?} {:?}", state.still, self.settings.model, self.settings.focal_px);
+            let look = |run: &mut Self| Ok(run.estimate(i, &latent, |frame, search| frame.estimate(search)));
+            let (tsf, detail, evidence) = self.remembered("blur", &own, |_| 0, look)?;
+            (state.tsfs[i], state.details[i]) = (tsf, detail);
+            let doubtful = std::mem::take(&mut self.registrations[i].doubtful);
+            match evidence {
+                Some(e) if !(doubtful && judge::is_other_scene(&e)) => {
+                    if doubtful {
+                        self.registrations[i].registered = true;
+                        self.registrations[i].reason = "no part of it tells by itself where it lies; its blur does".into();
+                    }
+                    if state.judgements[i].is_none() {
+                        state.judgements[i] = Some(judge::blurred(&e));
+                    }
+                }
+                // Nothing in it tells that it moved: its light counts where it lies.
+                None if may_join && !doubtful => {
+                    state.judgements[i] = Some(Judgement::untold());
+                    joined.push(i);
+                }
+                _ => {
+                    let why = if doubtful { self.registrations[i].reason.clone() } else { NO_TEXTURE.into() };
+                    self.leave_out(i, &why)?;
+                    state.judgements[i] = Some(Judgement { reason: why, ..Judgement::given(Kind::OtherScene) });
+                    state.shaken.retain(|&k| k != i);
+                }
+            }
+        }
+        self.memo.depends(&(self.settings.model, self.settings.focal_px));
+        state.joined = !joined.is_empty();
+        if state.joined {
+            self.place_stationary(state, &joined)?;
+        }
+        Ok(())
+    }
+
+    /// The frames `ids` count as they lie from here on: placed by all of their pixels, not by the middle of a blur.
+    fn place_stationary(&mut self, state: &mut State, ids: &[usize]) -> Result<()> {
+        for &i in ids {
+            state.count_as_it_lies(i);
+        }
+        let all = state.all();
+        let sharp: Vec<bool> = (0..self.bracket.frames().len()).map(|i| state.still.contains(&i)).collect();
+        let (reference, given) = (state.reference, state.given.clone());
+        let own = format!("{ids:?} {all:?}");
+        let found = self.remembered("place", &own, |_| 0, |run| run.register_on(reference, &all, &sharp, &given))?;
+        for &i in ids.iter().filter(|&&i| found[i].registered) {
+            self.motions[i] = found[i].motion();
+            self.registrations[i] = found[i].clone();
+        }
+        Ok(())
+    }
+
+    /// Irradiance of all frames and their TSFs refined against it, in turn, from what the stationary frames gave (`base`); `None` where no shaken frame counts.
+    fn rounds(&mut self, state: &mut State, base: Option<&Solution>) -> Result<Option<Solution>> {
+        if state.shaken.is_empty() {
+            return Ok(None);
+        }
+        let refined: Vec<usize> = state.shaken.iter().copied().filter(|&i| !state.given[i]).collect();
+        for &i in &state.still {
+            state.tsfs[i] = Some(Tsf::still(self.motions[i]));
+        }
+        let all = state.all();
+        let rounds = if refined.is_empty() { 1 } else { ROUNDS };
+        // TSFs that were given took no time.
+        let begun = if refined.is_empty() { 0.0 } else { 0.40 };
+        let mut latent = state.latent.clone().expect("a scene is known by now");
+        let mut solution: Option<Solution> = None;
+        for round in 0..rounds {
+            let at = |part: f32| begun + (0.98 - begun) * (round as f32 + part) / rounds as f32;
+            let own = format!("{round} {:?} {:?} {}", state.still, state.shaken, state.reduced);
+            if round > 0 || state.reduced {
+                self.progress("refining the blur", at(0.0))?;
+                for &i in &refined {
+                    let tsf = state.tsfs[i].clone();
+                    state.tsfs[i] =
+                        self.remembered("refinement", &format!("{i} {own}"), |_| 0, |run| Ok(run.refine(i, &latent, tsf.as_ref())))?;
+                }
+            }
+            if round + 1 == rounds {
+                self.find_aliasing(&state.still, &state.shaken, &latent, at(0.2), at(0.3))?;
+            }
+            let pad = self.pad(all.iter().filter_map(|&i| state.tsfs[i].as_ref()));
+            let from = match solution.as_ref().or(base) {
+                Some(found) => self.surrounded(&found.irradiance, found.pad, pad, &state.still, &state.shaken),
+                None => self.surrounded(&latent, 0, pad, &state.still, &state.shaken),
+            };
+            // The first round only has to be better than the sharp frames alone, for the TSFs to be refined against it.
+            let settings = if round + 1 < rounds { for_first_round(&self.settings.deblur) } else { self.settings.deblur.clone() };
+            let solved =
+                self.solved("irradiance", &own, &settings, |run| run.solve(&all, &state.tsfs, &from, pad, &settings, at(0.3), at(1.0)))?;
+            latent = solved.cropped();
+            solution = Some(solved);
+        }
+        Ok(solution)
+    }
+
+    /// For people to look at: patches of the shaken frames and their PSFs, eq. (11), against what the stationary ones show.
+    fn describe_blurs(&mut self, state: &mut State) -> Result<()> {
+        for &i in &state.shaken {
+            let (Some(tsf), Some(latent)) = (&state.tsfs[i], &state.latent) else { continue };
+            if state.details[i].is_null() {
+                continue;
+            }
+            let own = format!("{i} {:?} {:?}", self.settings.patches, self.settings.psf_radius);
+            state.details[i]["patches"] = self.remembered("PSFs", &own, |_| 0, |run| Ok(run.local_psfs(i, latent, tsf)))?;
+        }
+        let (w, h) = self.bracket.size();
+        for (detail, tsf) in state.details.iter_mut().zip(&state.tsfs) {
+            if let (true, Some(tsf)) = (detail.is_object(), tsf) {
+                detail["extent_px"] = serde_json::json!(tsf::extent(tsf, w, h));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What an estimate says of whether its frame moved.
+pub(super) fn evidence(found: &tsf::Estimate, size: (usize, usize)) -> BlurEvidence {
+    BlurEvidence {
+        still: found.still_worse_by,
+        still_error: found.still_error,
+        blank: found.blank_worse_by,
+        stroke: tsf::stroke(&found.tsf, size.0, size.1),
+    }
+}

@@ -1,0 +1,111 @@
+//! From files to exposures: exposure times that the pixels contradict, f⁻¹(Z), noise, gain and black of each frame.
+
+use super::engine::Memo;
+use super::{Run, Settings};
+use crate::error::Result;
+use crate::exposure::{Bracket, Frame};
+use crate::image::Rgb;
+use crate::noise::{self, FrameNoise};
+use crate::photometry;
+use crate::response::{self, Response};
+
+/// EV by which the pixels have to contradict a noted exposure for it to be replaced, and in standard deviations: what is less is found with the photometry, on registered
+/// pixels.
+const CONTRADICTED: (f64, f64) = (1.0, 4.0);
+/// Relative error of an exposure that no noise explains: curve, flare, interpolation. It keeps a frame without noise from outvoting all others.
+const MODEL: f64 = 0.01;
+
+/// Exposures and what is known of them before the frames are placed.
+#[derive(Clone)]
+pub(super) struct Prepared {
+    /// The bracket with other exposure times, where the pixels contradict those of the files.
+    pub corrected: Option<Bracket>,
+    pub exposures: Vec<Rgb>,
+    pub noise: Vec<FrameNoise>,
+    pub curves: Vec<[Vec<f32>; 3]>,
+    pub exposure_errors: Vec<(f64, f64)>,
+}
+
+/// Exposures of `bracket` and their noise, found or remembered.
+pub(super) fn prepared(memo: &mut Memo, bracket: &Bracket, response: &Response, settings: &Settings) -> Prepared {
+    if let Some((found, _)) = memo.recall::<Prepared>("exposures") {
+        return found;
+    }
+    let exposure_errors = response::exposure_errors(bracket, response);
+    let contradicted = |e: &(f64, f64)| e.0.abs() > CONTRADICTED.0 && e.0.abs() > CONTRADICTED.1 * e.1;
+    let corrected = exposure_errors.iter().any(contradicted).then(|| {
+        let time = |(f, e): (&Frame, &(f64, f64))| f.exposure_time * if contradicted(e) { e.0.exp2() } else { 1.0 };
+        bracket.with_exposure_times(bracket.frames().iter().zip(&exposure_errors).map(time))
+    });
+    let frames = bracket.frames();
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
+    let noise = settings.noise.map_or_else(|| noise::estimate(frames, &exposures, response), |given| noise::alike(frames.len(), given));
+    let curves = with_model(noise::curves(frames, response, &noise));
+    let found = Prepared { corrected, exposures, noise, curves, exposure_errors };
+    let pixels: usize = found.exposures.iter().map(|e| e.width() * e.height()).sum();
+    memo.keep("exposures", &found, 0, 12 * pixels);
+    found
+}
+
+/// Standard deviations with the model's own error.
+fn with_model(mut curves: Vec<[Vec<f32>; 3]>) -> Vec<[Vec<f32>; 3]> {
+    for curve in curves.iter_mut().flatten() {
+        let last = (curve.len() - 1) as f64;
+        for (k, s) in curve.iter_mut().enumerate() {
+            let x = (k as f64 / last).powi(2);
+            *s = f64::from(*s).hypot(MODEL * x) as f32;
+        }
+    }
+    curves
+}
+
+impl Run<'_> {
+    /// Says which exposure times were replaced.
+    pub(super) fn tell_of_exposures(&mut self) -> Result<()> {
+        let texts: Vec<String> = self
+            .exposure_errors
+            .iter()
+            .zip(self.bracket.frames())
+            .filter(|((ev, deviation), _)| ev.abs() > CONTRADICTED.0 && ev.abs() > CONTRADICTED.1 * deviation)
+            .map(|((ev, _), f)| format!("{} {ev:+.1} EV", f.name))
+            .collect();
+        if texts.is_empty() {
+            return Ok(());
+        }
+        self.warn(format!("the frames' pixels contradict the noted exposures: {}; they are merged as the pixels have it", texts.join(", ")))
+    }
+
+    /// Gains and black levels of the frames `ids` where they lie, taken off the exposures from here on.
+    pub(super) fn match_photometry(&mut self, ids: &[usize]) {
+        let frames = self.bracket.frames();
+        let found = photometry::photometry(frames, &self.exposures, &self.noise, ids, &self.motions);
+        self.take_photometry(found);
+    }
+
+    /// Standard deviations of the exposures by noise and rounding alone.
+    pub(super) fn curves_of_noise(&self) -> Vec<[Vec<f32>; 3]> {
+        let gains: Vec<[f64; 3]> = self.photometry.iter().map(photometry::FramePhotometry::factors).collect();
+        noise::curves_of(self.bracket.frames(), self.response, &self.noise, &gains)
+    }
+
+    /// Standard deviations of the exposures' noise as pixels show it against their neighbours.
+    pub(super) fn curves_of_detail(&self) -> Vec<[Vec<f32>; 3]> {
+        let noise: Vec<FrameNoise> = self.noise.iter().map(FrameNoise::of_detail).collect();
+        let gains: Vec<[f64; 3]> = self.photometry.iter().map(photometry::FramePhotometry::factors).collect();
+        noise::curves_of(self.bracket.frames(), self.response, &noise, &gains)
+    }
+
+    /// `found` as the photometry of exposures that are as the files have them.
+    pub(super) fn take_photometry(&mut self, found: Vec<photometry::FramePhotometry>) {
+        let frames = self.bracket.frames();
+        let gains: Vec<[f64; 3]> = found.iter().map(photometry::FramePhotometry::factors).collect();
+        for (i, one) in found.iter().enumerate() {
+            if *one != photometry::FramePhotometry::AS_NOTED {
+                self.exposures[i] = one.corrected(&self.exposures[i]);
+                self.noise[i] = self.noise[i].scaled(gains[i]);
+            }
+        }
+        self.curves = with_model(noise::curves_of(frames, self.response, &self.noise, &gains));
+        self.photometry = found;
+    }
+}
