@@ -26,13 +26,17 @@ pub(super) struct Prepared {
     pub exposure_errors: Vec<(f64, f64)>,
 }
 
+/// Whether an exposure's error, EV and its standard deviation, is such that the noted time is replaced.
+fn contradicted((ev, deviation): &(f64, f64)) -> bool {
+    ev.abs() > CONTRADICTED.0 && ev.abs() > CONTRADICTED.1 * deviation
+}
+
 /// Exposures of `bracket` and their noise, found or remembered.
 pub(super) fn prepared(memo: &mut Memo, bracket: &Bracket, response: &Response, settings: &Settings) -> Prepared {
     if let Some((found, _)) = memo.recall::<Prepared>("exposures") {
         return found;
     }
     let exposure_errors = response::exposure_errors(bracket, response);
-    let contradicted = |e: &(f64, f64)| e.0.abs() > CONTRADICTED.0 && e.0.abs() > CONTRADICTED.1 * e.1;
     let corrected = exposure_errors.iter().any(contradicted).then(|| {
         let time = |(f, e): (&Frame, &(f64, f64))| f.exposure_time * if contradicted(e) { e.0.exp2() } else { 1.0 };
         bracket.with_exposure_times(bracket.frames().iter().zip(&exposure_errors).map(time))
@@ -66,7 +70,7 @@ impl Run<'_> {
             .exposure_errors
             .iter()
             .zip(self.bracket.frames())
-            .filter(|((ev, deviation), _)| ev.abs() > CONTRADICTED.0 && ev.abs() > CONTRADICTED.1 * deviation)
+            .filter(|(error, _)| contradicted(error))
             .map(|((ev, _), f)| format!("{} {ev:+.1} EV", f.name))
             .collect();
         if texts.is_empty() {
@@ -84,28 +88,29 @@ impl Run<'_> {
 
     /// Standard deviations of the exposures by noise and rounding alone.
     pub(super) fn curves_of_noise(&self) -> Vec<[Vec<f32>; 3]> {
+        self.curves_under(&self.noise)
+    }
+
+    /// Standard deviations of the exposures as they are by `noise` and rounding.
+    fn curves_under(&self, noise: &[FrameNoise]) -> Vec<[Vec<f32>; 3]> {
         let gains: Vec<[f64; 3]> = self.photometry.iter().map(photometry::FramePhotometry::factors).collect();
-        noise::curves_of(self.bracket.frames(), self.response, &self.noise, &gains)
+        noise::curves_of(self.bracket.frames(), self.response, noise, &gains)
     }
 
     /// Standard deviations of the exposures' noise as pixels show it against their neighbours.
     pub(super) fn curves_of_detail(&self) -> Vec<[Vec<f32>; 3]> {
-        let noise: Vec<FrameNoise> = self.noise.iter().map(FrameNoise::of_detail).collect();
-        let gains: Vec<[f64; 3]> = self.photometry.iter().map(photometry::FramePhotometry::factors).collect();
-        noise::curves_of(self.bracket.frames(), self.response, &noise, &gains)
+        self.curves_under(&self.noise.iter().map(FrameNoise::of_detail).collect::<Vec<_>>())
     }
 
     /// `found` as the photometry of exposures that are as the files have them.
     pub(super) fn take_photometry(&mut self, found: Vec<photometry::FramePhotometry>) {
-        let frames = self.bracket.frames();
-        let gains: Vec<[f64; 3]> = found.iter().map(photometry::FramePhotometry::factors).collect();
         for (i, one) in found.iter().enumerate() {
             if *one != photometry::FramePhotometry::AS_NOTED {
                 self.exposures[i] = one.corrected(&self.exposures[i]);
-                self.noise[i] = self.noise[i].scaled(gains[i]);
+                self.noise[i] = self.noise[i].scaled(one.factors());
             }
         }
-        self.curves = with_model(noise::curves_of(frames, self.response, &self.noise, &gains));
         self.photometry = found;
+        self.curves = with_model(self.curves_of_noise());
     }
 }
