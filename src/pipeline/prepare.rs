@@ -97,6 +97,12 @@ impl Run<'_> {
         noise::curves_of(self.bracket.frames(), self.response, noise, &gains)
     }
 
+    /// [`Run::curves_of_detail`] of frame `i` alone.
+    pub(super) fn curve_of_detail(&self, i: usize) -> [Vec<f32>; 3] {
+        let (noise, gain) = (self.noise[i].of_detail(), self.photometry[i].factors());
+        noise::curves_of(&self.bracket.frames()[i..=i], self.response, &[noise], &[gain]).remove(0)
+    }
+
     /// Standard deviations of the exposures' noise as pixels show it against their neighbours.
     pub(super) fn curves_of_detail(&self) -> Vec<[Vec<f32>; 3]> {
         self.curves_under(&self.noise.iter().map(FrameNoise::of_detail).collect::<Vec<_>>())

@@ -75,7 +75,7 @@ impl Run<'_> {
         let frame = &self.bracket.frames()[i];
         let dt = frame.exposure_time as f32;
         let (channels, mask) = (self.looks[i].0, self.looks[i].1.as_ref().unwrap_or(&self.masks[i]));
-        let noise = noise::of_mean_of(&self.curves_of_detail()[i], channels);
+        let noise = noise::of_mean_of(&self.curve_of_detail(i), channels);
         let (seen, inside) = self.seen(latent, motion);
         let seen = seen.mean_of(channels);
         let exposure = self.exposures[i].mean_of(channels);

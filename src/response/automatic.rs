@@ -65,10 +65,8 @@ const FEWEST: usize = 12;
 const ENOUGH_FOR_CURVE: usize = 120;
 /// Highest power of the intensity in ln f⁻¹.
 const MOST_POWERS: usize = 5;
-/// A curve with more unknowns must lower the held-out residual by this part.
+/// A curve with more unknowns, or three curves instead of one, must lower the held-out residual by this part.
 const WORTH_IT: f64 = 0.02;
-/// Three curves instead of one must lower it by this part: few blocks are of a strong colour. (Where nothing moved there are many: [`WORTH_IT`].)
-const WORTH_THREE: f64 = 0.1;
 /// Prior of the unknowns of ln f⁻¹: exponent 2.2 ± 2, coefficients 0 ± 4. Only directions that no shade determines feel it.
 const PRIOR: (f64, f64, f64) = (2.2, 2.0, 4.0);
 /// Smallest standard deviation of ln f⁻¹ of a shade: what lens and light change from frame to frame.
@@ -153,12 +151,10 @@ pub fn exposure_errors(bracket: &Bracket, response: &Response) -> Vec<(f64, f64)
 /// edges as well: there are more shades, and nearer to white. What is not a power law in the deepest shadows (sRGB below code 20) is not seen.
 ///
 /// # Errors
-/// Those of [`automatic`].
+/// [`Error::Bracket`] when fewer than 12 blocks are well exposed in two frames of different exposure time, or no exponent from 0.4 to 6 explains
+/// them.
 pub fn of_still_frames(bracket: &Bracket) -> Result<OfStillFrames> {
-    estimated(bracket, &Motion::None)
-}
-
-fn estimated(bracket: &Bracket, motion: &Motion) -> Result<OfStillFrames> {
+    let motion = &Motion::None;
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
     let refuse = |why: String| {
@@ -177,8 +173,7 @@ fn estimated(bracket: &Bracket, motion: &Motion) -> Result<OfStillFrames> {
             return Err(refuse(format!("only {telling} of their blocks are well exposed in two frames of different exposure time")));
         }
         let problem = Problem { shades: &shades, times: &times, held: true };
-        let worth_three = if matches!(motion, Motion::None) { WORTH_IT } else { WORTH_THREE };
-        let shape = if telling < ENOUGH_FOR_CURVE { Shape { powers: 0, shared: true } } else { problem.choose(worth_three) };
+        let shape = if telling < ENOUGH_FOR_CURVE { Shape { powers: 0, shared: true } } else { problem.choose() };
         let fit = problem.believable(shape).ok_or_else(|| refuse("no curve that a camera could have explains them".into()))?;
         curves = fit.curves.clone();
         chosen = Some((fit, telling));
@@ -327,8 +322,8 @@ struct Problem<'a> {
 }
 
 impl Problem<'_> {
-    /// The simplest shape whose held-out residual is near the least; three curves instead of one must lower it by the part `worth_three`.
-    fn choose(&self, worth_three: f64) -> Shape {
+    /// The simplest shape whose held-out residual is near the least.
+    fn choose(&self) -> Shape {
         let score = |shape: Shape| -> f64 {
             let folds = [0, 1].map(|fold| {
                 let kept = |s: &Shade| (s.block.0 / 4 + s.block.1 / 4) % 2 == fold;
@@ -345,7 +340,7 @@ impl Problem<'_> {
             }
         }
         let apart = Shape { shared: false, ..best.1 };
-        if score(apart) < (1.0 - worth_three) * best.0 {
+        if score(apart) < (1.0 - WORTH_IT) * best.0 {
             best.1 = apart;
         }
         best.1
