@@ -45,6 +45,7 @@ pub mod psf;
 pub mod random;
 pub mod register;
 pub mod response;
+mod robust;
 mod sampling;
 pub mod synth;
 pub mod tonemap;

@@ -41,11 +41,16 @@ impl NoiseModel {
     /// Standard deviation, quantisation of `levels` steps through the response included, at [`NOISE_STEPS`] equal steps of
     /// √exposure from 0 to 1.
     pub fn curve(&self, response: &Response, channel: usize, levels: u32) -> Vec<f32> {
+        self.curve_times(1.0, response, channel, levels)
+    }
+
+    /// [`NoiseModel::curve`] of exposures that were multiplied by `gain`, whose noise this is.
+    fn curve_times(&self, gain: f64, response: &Response, channel: usize, levels: u32) -> Vec<f32> {
         let quantum = quantisation(response, channel, levels);
         (0..NOISE_STEPS)
             .map(|i| {
                 let x = (i as f64 / (NOISE_STEPS - 1) as f64).powi(2);
-                (self.variance(x) + quantum(x)).sqrt() as f32
+                (self.variance(x) + gain * gain * quantum(x / gain)).sqrt() as f32
             })
             .collect()
     }
@@ -118,14 +123,7 @@ pub fn alike(frames: usize, model: NoiseModel) -> Vec<FrameNoise> {
 /// Standard deviation of the exposures of each frame's channels, see [`NoiseModel::curve`]; `gains`: what the exposures were multiplied by.
 pub fn curves_of(frames: &[Frame], response: &Response, noise: &[FrameNoise], gains: &[[f64; 3]]) -> Vec<[Vec<f32>; 3]> {
     let one = |(f, (n, gain)): (&Frame, (&FrameNoise, &[f64; 3]))| {
-        std::array::from_fn(|c| {
-            let quantum = quantisation(response, c, f.levels);
-            let at = |i: usize| {
-                let x = (i as f64 / (NOISE_STEPS - 1) as f64).powi(2);
-                (n.channels[c].variance(x) + gain[c] * gain[c] * quantum(x / gain[c])).sqrt() as f32
-            };
-            (0..NOISE_STEPS).map(at).collect()
-        })
+        std::array::from_fn(|c| n.channels[c].curve_times(gain[c], response, c, f.levels))
     };
     frames.iter().zip(noise.iter().zip(gains)).map(one).collect()
 }

@@ -11,6 +11,7 @@ use crate::image::Rgb;
 use crate::mask::CLIPPED;
 use crate::noise::FrameNoise;
 use crate::pose::project;
+use crate::robust::precision;
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -26,8 +27,6 @@ const MODEL: f64 = 0.03;
 const INDEPENDENT: f64 = 60.0;
 /// Part of the difference to the neighbouring squares that blur and displacement move into one.
 const MOVED: f64 = 0.3;
-/// Residuals, in standard deviations, beyond which a square loses its say (Cauchy).
-const TAIL: f64 = 2.5;
 /// The longer side holds so many squares, and a square has at least so many pixels a side.
 const SQUARES: usize = 60;
 const LEAST_SIDE: usize = 5;
@@ -149,11 +148,6 @@ fn squares(frame: &Frame, exposure: &Rgb, noise: &FrameNoise, c: usize, motion: 
             Some(Square { mean: own, deviation: variance.sqrt() })
         })
         .collect()
-}
-
-/// Weight of a deviation `d` with standard deviation `sigma` under a heavy tail.
-fn precision(d: f64, sigma: f64) -> f64 {
-    1.0 / (sigma * sigma * (1.0 + (d / (TAIL * sigma)).powi(2)))
 }
 
 /// Gain, offset and number of squares of each frame.

@@ -36,14 +36,15 @@ pub(super) fn prepared(memo: &mut Memo, bracket: &Bracket, response: &Response, 
     if let Some((found, _)) = memo.recall::<Prepared>("exposures") {
         return found;
     }
-    let exposure_errors = response::exposure_errors(bracket, response);
-    let corrected = exposure_errors.iter().any(contradicted).then(|| {
-        let time = |(f, e): (&Frame, &(f64, f64))| f.exposure_time * if contradicted(e) { e.0.exp2() } else { 1.0 };
-        bracket.with_exposure_times(bracket.frames().iter().zip(&exposure_errors).map(time))
-    });
     let frames = bracket.frames();
     let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, response)).collect();
-    let noise = settings.noise.map_or_else(|| noise::estimate(frames, &exposures, response), |given| noise::alike(frames.len(), given));
+    let noise = noise::estimate(frames, &exposures, response);
+    let exposure_errors = response::exposure_errors(bracket, response, &noise);
+    let corrected = exposure_errors.iter().any(contradicted).then(|| {
+        let time = |(f, e): (&Frame, &(f64, f64))| f.exposure_time * if contradicted(e) { e.0.exp2() } else { 1.0 };
+        bracket.with_exposure_times(frames.iter().zip(&exposure_errors).map(time))
+    });
+    let noise = settings.noise.map_or(noise, |given| noise::alike(frames.len(), given));
     let curves = with_model(noise::curves(frames, response, &noise));
     let found = Prepared { corrected, exposures, noise, curves, exposure_errors };
     let pixels: usize = found.exposures.iter().map(|e| e.width() * e.height()).sum();

@@ -136,12 +136,13 @@ fn noise_under(frames: &[Frame], response: &Response) -> Vec<FrameNoise> {
 
 /// By how many EV each frame of `bracket` was exposed more than its time says, and the standard deviation of that, as its pixels have it under a `response`
 /// that is known: aperture and ISO speed that changed, gain that a file does not note. Small next to the deviation where frames share too few shades.
-pub fn exposure_errors(bracket: &Bracket, response: &Response) -> Vec<(f64, f64)> {
+/// `noise`: each frame's under that response.
+pub fn exposure_errors(bracket: &Bracket, response: &Response, noise: &[FrameNoise]) -> Vec<(f64, f64)> {
     let frames = bracket.frames();
     let times: Vec<f64> = frames.iter().map(|f| f.exposure_time.ln()).collect();
     let shades = shades::collect(frames, &Motion::Shaken(displacements(frames)), &|c, z| response.inverse(c, z));
     let ev = |v: &f64| v / std::f64::consts::LN_2;
-    match posterior(&shades, &times, &noise_under(frames, response), &Curve::Known(response), None) {
+    match posterior(&shades, &times, noise, &Curve::Known(response), None) {
         Some(found) => found.exposures.iter().map(ev).zip(found.deviations.iter().map(ev)).collect(),
         None => vec![(0.0, f64::INFINITY); frames.len()],
     }

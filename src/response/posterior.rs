@@ -5,6 +5,7 @@ use super::Response;
 use super::prior::{COEFFICIENTS, CurvePrior, of_srgb, terms};
 use super::shades::{CROWD, Shade};
 use crate::noise::FrameNoise;
+use crate::robust::precision;
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 /// Standard deviation of ln Δt about what is noted: shutters keep the series of powers of two, cameras note 1/30 for 1/32 (0.09 EV).
@@ -19,8 +20,6 @@ const BLACK: f64 = 2e-3;
 const OWN_BLACK: f64 = 4e-4;
 /// Exposures below count as this one where the black level is taken off.
 const LEAST: f64 = 1e-3;
-/// Deviations beyond so many standard deviations count as those of a file that notes something else (Cauchy).
-const TAIL: f64 = 2.5;
 /// Reweighting rounds.
 const ROUNDS: usize = 12;
 
@@ -58,11 +57,6 @@ impl Curve<'_> {
             }
         }
     }
-}
-
-/// Weight of a deviation `d` with standard deviation `sigma` under a heavy tail.
-fn precision(d: f64, sigma: f64) -> f64 {
-    1.0 / (sigma * sigma * (1.0 + (d / (TAIL * sigma)).powi(2)))
 }
 
 fn log(coefficients: &[f64], z: f64) -> (f64, f64) {

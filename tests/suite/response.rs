@@ -4,6 +4,7 @@ use crate::support::files::{Noise, scene, shared};
 use unshaken::exposure::{Bracket, Frame};
 use unshaken::image::{Plane, Rgb};
 use unshaken::io::{ldr, metadata};
+use unshaken::noise;
 use unshaken::response::{
     DISAGREEMENT_EV, Provenance, Response, ResponseFile, automatic, calibrate, check_exposures, exposure_errors, mitsunaga, of_still_frames,
 };
@@ -289,6 +290,12 @@ fn srgb_bracket() -> Bracket {
     synth::capture(&synth::room(240, 180, 24, 3), &Camera::default(), &times, 0.5, 5).unwrap().bracket
 }
 
+/// [`exposure_errors`] under the noise that is estimated.
+fn errors_of(bracket: &Bracket, response: &Response) -> Vec<(f64, f64)> {
+    let exposures: Vec<Rgb> = bracket.frames().iter().map(|f| noise::exposure(f, response)).collect();
+    exposure_errors(bracket, response, &noise::estimate(bracket.frames(), &exposures, response))
+}
+
 /// EV by which the exposure that `found` gives code 128 differs from that of sRGB.
 fn middle_error(found: &Response) -> f64 {
     let z = 128.0 / 255.0;
@@ -347,7 +354,7 @@ fn an_exposure_that_is_noted_far_off_is_found() {
     for (wrong, ev) in [(0, 3.0f64), (1, -3.0), (2, 3.0), (3, -3.0)] {
         let mut factors = [1.0; 4];
         factors[wrong] = (-ev).exp2();
-        let found = exposure_errors(&with_times(&exact, &factors), &Response::Srgb);
+        let found = errors_of(&with_times(&exact, &factors), &Response::Srgb);
         println!("frame {wrong} by {ev} EV: {found:.3?}");
         for (i, (error, deviation)) in found.iter().enumerate() {
             let (planted, most) = if i == wrong { (ev, 0.4) } else { (0.0, 0.2) };
@@ -400,7 +407,7 @@ fn correct_real_brackets_raise_no_alarm() {
     let bracket = Bracket::new(frames.to_vec()).unwrap();
     let found = automatic(&bracket);
     assert_rises(&found.response);
-    let errors = exposure_errors(&bracket, &found.response);
+    let errors = errors_of(&bracket, &found.response);
     assert!(errors.iter().all(|e| e.0.abs() < 0.2), "{errors:.3?}");
     // The frames are brighter in the shadows and flatter in the highlights than sRGB, which must show.
     assert!(check_exposures(&bracket, &Response::Srgb).warning(&bracket).is_some());
