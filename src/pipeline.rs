@@ -28,6 +28,7 @@ mod progress;
 mod report;
 mod shaken;
 mod solve;
+mod stationary;
 
 pub use blind::Blind;
 pub use engine::Engine;

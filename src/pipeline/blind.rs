@@ -1,7 +1,7 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run, Settings};
-use crate::blind::{self, Frame, Lack, PatchSetup, Start};
+use crate::blind::{self, Doubt, Frame, Lack, PatchSetup, Start};
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
@@ -209,6 +209,27 @@ impl Run<'_> {
             self.motions[i] = tsf.centre();
         }
         Self::coloured(&self.blurred_merge(used), luminance, channels)
+    }
+
+    /// What speaks for it that the frame `first`, the only one of the frames `used` that is taken for stationary, moved as well; `None` where its edges are as hard as a sharp frame's.
+    pub(super) fn doubt(&mut self, first: usize, used: &[usize]) -> Result<Option<Doubt>> {
+        if !self.is_soft(first) {
+            return Ok(None);
+        }
+        self.remembered(
+            "doubt",
+            &format!("{first} {used:?}"),
+            |_| 0,
+            |run| {
+                let channels = run.most_telling(used, used);
+                let frames = run.luminance_frames(used, channels);
+                let reference = used.iter().position(|&i| i == first).unwrap_or(0);
+                let start = Start { reference, luminance: run.alone(first, channels) };
+                let stage = format!("looking whether {} moved as well", run.bracket.frames()[first].name);
+                let found = blind::doubt(&frames, &start, &mut || run.progress(&stage, 0.40).is_ok());
+                found.map(Some).ok_or(Error::Cancelled)
+            },
+        )
     }
 
     /// Whether the edges of frame `i` are as soft, in one direction at least, as a motion makes them.

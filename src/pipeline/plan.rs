@@ -5,6 +5,7 @@ use super::judge::{self, BlurEvidence, Judgement, Kind};
 use super::place::Placed;
 use super::shaken::{for_estimates, for_first_round};
 use super::{Outcome, Run};
+use crate::blind;
 use crate::deblur::{self, Solution};
 use crate::error::Result;
 use crate::image::Rgb;
@@ -32,7 +33,7 @@ pub(super) struct State {
     /// Whether a TSF was given.
     given: Vec<bool>,
     /// The irradiance as it is known.
-    latent: Option<Rgb>,
+    pub latent: Option<Rgb>,
     /// Whether the TSFs of all frames come from a smaller size than the frames'.
     reduced: bool,
     /// Whether a frame has joined the stationary ones since these were solved for.
@@ -202,7 +203,11 @@ impl Run<'_> {
     fn doubt_the_first(&mut self, state: &mut State) -> Result<()> {
         let [first] = state.still[..] else { return Ok(()) };
         let asked = self.settings.blind == Blind::Auto && self.settings.sharp.is_none() && !state.given.contains(&true);
-        if asked && !state.shaken.is_empty() && state.shaken.iter().all(|&i| state.tsfs[i].is_some()) && self.is_soft(first) {
+        let explained = !state.shaken.is_empty() && state.shaken.iter().all(|&i| state.tsfs[i].is_some());
+        let doubt = if asked && explained { self.doubt(first, &state.all())? } else { None };
+        state.judgements[first] =
+            doubt.as_ref().map(|d| judge::doubted(d.stroke_px, blind::STROKE, d.is_founded())).or(state.judgements[first].take());
+        if doubt.is_some_and(|d| d.is_founded()) {
             self.take_all_blurs(state)?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
@@ -212,7 +217,7 @@ impl Run<'_> {
     }
 
     /// Reference, places, ghosts and masks of the frames as `state` has them.
-    fn lay_out(&mut self, state: &mut State) -> Result<()> {
+    pub(super) fn lay_out(&mut self, state: &mut State) -> Result<()> {
         let all = state.all();
         if state.latent.is_none() {
             let longest = self.bracket.longest(&state.still);
@@ -233,70 +238,8 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Which frames are stationary, and what they show. The shortest frame that shows enough is the first; each other one is stationary unless a motion explains it
-    /// better than none beside what that shows; and the first one has to stand the same beside the others that do. `None` where another scene is known.
-    fn stationary_frames(&mut self, state: &mut State) -> Result<Option<Solution>> {
-        if state.latent.is_some() {
-            self.lay_out(state)?;
-            return Ok(None);
-        }
-        if !state.still.is_empty() {
-            return self.solve_base(state).map(Some);
-        }
-        let used = state.all();
-        let placed: Vec<usize> = used.iter().copied().filter(|&i| !self.registrations[i].doubtful).collect();
-        let anchor = self.first_reference(&placed).unwrap_or(used[0]);
-        let own = format!("{used:?}");
-        let (judgements, still, motions, registrations) = self.remembered(
-            "stationary frames",
-            &own,
-            |_| 0,
-            |run| {
-                let judged = run.judge_beside(state, anchor, &placed)?;
-                Ok((judged.0, judged.1, run.motions.clone(), run.registrations.clone()))
-            },
-        )?;
-        (self.motions, self.registrations) = (motions, registrations);
-        (state.judgements, state.still) = (judgements, still);
-        state.shaken = used.into_iter().filter(|i| !state.still.contains(i)).collect();
-        self.solve_base(state).map(Some)
-    }
-
-    /// Judgements of the frames `placed` beside `anchor`, and those that are stationary.
-    fn judge_beside(&mut self, state: &mut State, anchor: usize, placed: &[usize]) -> Result<(Vec<Option<Judgement>>, Vec<usize>)> {
-        let others: Vec<usize> = placed.iter().copied().filter(|&i| i != anchor).collect();
-        state.judgements[anchor] = Some(Judgement::anchor());
-        (state.still, state.shaken) = (vec![anchor], others.clone());
-        let scene = self.solve_base(state)?.cropped();
-        self.progress("looking which frames moved", 0.08)?;
-        for (&i, found) in others.iter().zip(self.looked_at(&others, &scene)) {
-            // Nothing in it tells that it moved: its light counts where it lies.
-            state.judgements[i] = Some(found.map_or_else(Judgement::untold, |e| judge::blurred(&e)));
-        }
-        let is = |state: &State, i: usize| state.judgements[i].as_ref().is_some_and(|j| j.kind == Kind::Stationary);
-        let joined: Vec<usize> = others.iter().copied().filter(|&i| is(state, i)).collect();
-        if joined.is_empty() {
-            return Ok((state.judgements.clone(), vec![anchor]));
-        }
-        self.place_stationary(state, &joined)?;
-        // The other way round: what does the first frame look like beside those?
-        (state.still, state.shaken) = (joined.clone(), others.iter().copied().filter(|i| !joined.contains(i)).chain([anchor]).collect());
-        let scene = self.solve_base(state)?.cropped();
-        if let Some(e) = self.looked_at(&[anchor], &scene).remove(0) {
-            let judgement = judge::blurred(&e);
-            if judgement.kind == Kind::Moved {
-                state.judgements[anchor] = Some(judgement);
-                return Ok((state.judgements.clone(), joined));
-            }
-        }
-        state.still.push(anchor);
-        state.still.sort_unstable();
-        state.shaken.retain(|&i| i != anchor);
-        Ok((state.judgements.clone(), state.still.clone()))
-    }
-
     /// What the stationary frames show: masks, ghosts and their solution.
-    fn solve_base(&mut self, state: &mut State) -> Result<Solution> {
+    pub(super) fn solve_base(&mut self, state: &mut State) -> Result<Solution> {
         self.lay_out(state)?;
         let settings = self.stationary_settings(state);
         let settings = if state.shaken.is_empty() { settings } else { for_estimates(&settings) };
@@ -396,7 +339,7 @@ impl Run<'_> {
     }
 
     /// The frames `ids` count as they lie from here on: placed by all of their pixels, not by the middle of a blur.
-    fn place_stationary(&mut self, state: &mut State, ids: &[usize]) -> Result<()> {
+    pub(super) fn place_stationary(&mut self, state: &mut State, ids: &[usize]) -> Result<()> {
         for &i in ids {
             state.count_as_it_lies(i);
         }

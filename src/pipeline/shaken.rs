@@ -1,14 +1,14 @@
 //! Blurs of shaken frames against the irradiance that others show: their TSFs and their PSFs.
 
 use super::Run;
-use super::judge::{self, BlurEvidence};
+use super::judge::BlurEvidence;
 use super::plan::evidence;
 use crate::channels;
 use crate::deblur::{self, Prior};
 use crate::image::{Channels, Plane, Rgb};
 use crate::merge;
 use crate::noise;
-use crate::pose::project;
+use crate::pose::{nearest_pixel, project};
 use crate::psf;
 use crate::register;
 use crate::tsf::{self, Search, Tsf, WholeFrame};
@@ -123,15 +123,25 @@ impl Run<'_> {
         (Some(found.tsf), detail, Some(evidence))
     }
 
-    /// Whether each of the frames `ids` moved beside the irradiance `latent`, as motions in the image plane tell; `None` for one with too little texture to tell.
-    pub(super) fn looked_at(&self, ids: &[usize], latent: &Rgb) -> Vec<Option<BlurEvidence>> {
+    /// What motions in the image plane tell of whether the frame `i` moved beside the irradiance `latent`, which the frame `by` shows, at 1, 1/2, 1/4 of its size; `None` where
+    /// there is too little texture to tell.
+    pub(super) fn looked_at(&self, i: usize, latent: &Rgb, by: usize) -> Vec<Option<BlurEvidence>> {
         let search = Search { model: tsf::Model::Rigid, focal_px: self.settings.focal_px, stop: self.stop.clone() };
-        let frames: Vec<(DMat3, Luminances)> = ids.iter().map(|&i| (self.base(i), self.luminances(i, latent, &self.base(i)))).collect();
-        let look = |(base, luminances): &(DMat3, Luminances)| {
-            let found = luminances.frame(*base).estimates(&search, LOOKED_AT);
-            judge::strongest(found.iter().filter(|e| e.is_sound()).map(|e| evidence(e, latent.size())))
-        };
-        frames.par_iter().map(look).collect()
+        let base = self.base(i);
+        let mut luminances = self.luminances(i, latent, &base);
+        self.forget_unshown(&mut luminances.weight, by, &base);
+        let found = luminances.frame(base).estimates(&search, LOOKED_AT);
+        found.into_iter().map(|e| e.filter(tsf::Estimate::is_sound).map(|e| evidence(&e, latent.size()))).collect()
+    }
+
+    /// Sets the `weight` of a frame at `motion` to 0 where the frame `by`, in place, does not show what it sees.
+    fn forget_unshown(&self, weight: &mut Plane, by: usize, motion: &DMat3) {
+        let (w, h) = weight.size();
+        let back = motion.inverse();
+        for (p, v) in weight.data.iter_mut().enumerate() {
+            let shown = nearest_pixel(&back, w, h, p % w, p / w).is_some_and(|q| self.masks[by].data[q] > 0.0);
+            *v = if shown { *v } else { 0.0 };
+        }
     }
 
     /// Patches of frame `i` and their PSFs, as the report has them.

@@ -6,6 +6,7 @@
 use super::Tsf;
 use super::continuous::{Evidence, mean_square};
 use super::from_psfs::nominal_focal;
+use super::held_out::{Filters, HeldOut, Worse};
 use super::model::{Chart, Coordinates, Model};
 use super::whole_frame::{Row, WholeFrame};
 use crate::image::Plane;
@@ -97,8 +98,6 @@ const RADIUS: usize = 16;
 const DEGREES: f64 = 2.5;
 /// Extent of the blur in pixels beyond which a coarser level tells all that can be told.
 const FINEST_EXTENT: f64 = 48.0;
-/// Sides of the blocks that are held out, as a part of the longer side.
-const BLOCKS: usize = 14;
 /// Focal lengths tried, times the longer side: from a wide lens to a short telephoto lens.
 const FOCALS: [f64; 4] = [0.6, 0.85, 1.7, 2.4];
 /// Iterations of a trial: the start is near.
@@ -346,7 +345,7 @@ fn main_path(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
 impl WholeFrame<'_> {
     /// [`WholeFrame::estimate`] of this frame and of it at 1/2, 1/4, ... of its size, `levels` sizes in all as far as they show anything: where the latent irradiance is
     /// noisy, coarse structure tells more of a blur than fine. The TSFs are on this frame's pixels.
-    pub fn estimates(&self, search: &Search, levels: usize) -> Vec<Estimate> {
+    pub fn estimates(&self, search: &Search, levels: usize) -> Vec<Option<Estimate>> {
         let (w, h) = self.size();
         let fits = |l: &usize| *l == 0 || w.min(h) >> l >= SMALLEST;
         let smaller = self.levels((0..levels).filter(fits).count().max(1) - 1);
@@ -354,7 +353,7 @@ impl WholeFrame<'_> {
             let found = if l == 0 { self.estimate(search) } else { smaller[l - 1].frame().estimate(search) }?;
             Some(Estimate { tsf: found.tsf.scaled(f64::from(1u32 << l)), scale: found.scale << l, ..found })
         };
-        (0..=smaller.len()).filter_map(one).collect()
+        (0..=smaller.len()).map(one).collect()
     }
 
     /// TSF of this frame from nothing; `None` when no pose explains it better than none.
@@ -481,7 +480,7 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
         tried.push((model, focal, blocks.clone()));
         blocks
     };
-    let best = if search.model == Model::Auto {
+    if search.model == Model::Auto {
         attempt(Model::Translation, focal);
         let rigid = attempt(Model::Rigid, focal);
         let turned = attempt(Model::Rotation, focal);
@@ -512,13 +511,19 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
             chosen_focal = rotations.min_by(|a, b| a.worse_by.total_cmp(&b.worse_by)).map_or(focal, |t| t.focal_px);
             source = "found";
         }
-        best.2
-    } else {
-        attempt(search.model, focal)
-    };
-    let still = fit(&held.inside, Model::Rigid, focal, &Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose"), TRIAL);
-    let worse = |residual: &[f32]| Worse::than(&held.blocks(residual), &best);
-    let (than_still, blank_worse_by) = (worse(&judge.residual(&still)), worse(judge.targets()).by);
+    }
+    let one = Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose");
+    let filters = Filters::of(frame);
+    let (mut in_place, mut moving, mut nothing) = (Vec::new(), Vec::new(), Vec::new());
+    for half in HeldOut::halves(&all, (w, h)) {
+        let still = fit(&half.inside, Model::Rigid, focal, &one, TRIAL);
+        let moved = fit(&half.inside, model, chosen_focal, &start, TRIAL);
+        in_place.extend(half.blocks(&filters.residual(frame, &half, &still)));
+        moving.extend(half.blocks(&filters.residual(frame, &half, &moved)));
+        nothing.extend(half.blocks(&frame.targets(&half.outside)));
+    }
+    let than_still = Worse::than(&in_place, &moving);
+    let blank_worse_by = Worse::than(&nothing, &moving).by;
     let (still_worse_by, still_error) = (than_still.by, than_still.error());
     let here = fit(&all, model, chosen_focal, &start, 10);
     let evidence = Evidence::new(frame, &all);
@@ -569,64 +574,6 @@ pub(super) fn model_of(tsf: &Tsf) -> Model {
         (true, false) => Model::Rotation,
         (false, _) if any(|p| p.theta_z_deg) => Model::Rigid,
         (false, _) => Model::Translation,
-    }
-}
-
-/// Differences of a frame to fit to and, in every fifth block of it, to judge by.
-struct HeldOut {
-    inside: Vec<Row>,
-    outside: Vec<Row>,
-    block: usize,
-}
-
-impl HeldOut {
-    fn of(rows: &[Row], size: (usize, usize)) -> Self {
-        let block = size.0.max(size.1).div_ceil(BLOCKS);
-        let (outside, inside) = rows.iter().partition(|r| (r.x as usize / block * 7 + r.y as usize / block * 13).is_multiple_of(5));
-        Self { inside, outside, block }
-    }
-
-    /// The block and the square of each residual of the differences held out.
-    fn blocks(&self, residual: &[f32]) -> Vec<(usize, f64)> {
-        let block = |r: &Row| r.y as usize / self.block * 1000 + r.x as usize / self.block;
-        self.outside.iter().zip(residual).map(|(o, v)| (block(o), f64::from(*v).powi(2))).collect()
-    }
-}
-
-/// How much worse a model explains held-out differences than another: the mean over blocks of the logarithm of the ratio of their squared
-/// residuals (a sum over the frame would speak of its brightest edges alone), and that in standard errors.
-#[derive(Clone, Copy)]
-struct Worse {
-    by: f64,
-    errors: f64,
-}
-
-impl Worse {
-    fn than(a: &[(usize, f64)], b: &[(usize, f64)]) -> Self {
-        let mut blocks: BTreeMap<usize, (f64, f64, f64)> = BTreeMap::new();
-        for (x, y) in a.iter().zip(b) {
-            let block = blocks.entry(x.0).or_default();
-            *block = (block.0 + x.1, block.1 + y.1, block.2 + 1.0);
-        }
-        // A tenth of the noise: blocks that are explained better than that say nothing more.
-        let ratios: Vec<f64> = blocks.values().filter(|b| b.2 >= 8.0).map(|b| ((b.0 + 0.1 * b.2) / (b.1 + 0.1 * b.2)).ln()).collect();
-        let n = ratios.len() as f64;
-        if n < 2.0 {
-            return Self { by: 0.0, errors: 0.0 };
-        }
-        let mean = ratios.iter().sum::<f64>() / n;
-        let variance = ratios.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0);
-        Self { by: mean, errors: if variance > 0.0 { mean / (variance / n).sqrt() } else { 0.0 } }
-    }
-
-    /// Standard error of `by`.
-    fn error(self) -> f64 {
-        if self.errors == 0.0 { 0.0 } else { (self.by / self.errors).abs() }
-    }
-
-    /// Whether the simpler model may be taken all the same: less than a per cent is nothing, up to 8 % if it may be chance.
-    fn forgivable(self) -> bool {
-        self.by < 0.01 || self.by < 0.08 && self.errors < 2.0
     }
 }
 

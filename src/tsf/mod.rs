@@ -7,6 +7,7 @@ mod continuous;
 mod estimate;
 mod from_psfs;
 mod grid_search;
+mod held_out;
 mod model;
 mod taps;
 mod unseen;

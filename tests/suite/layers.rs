@@ -438,7 +438,8 @@ fn judgements_know_nothing_but_numbers() {
     for (_, text) in all {
         assert!(paths(&text, "crate::").is_empty(), "{:?}", paths(&text, "crate::"));
         for path in paths(&text, "super::") {
-            assert!(["Judgement", "Kind", "*"].contains(&path.as_str()), "super::{path}");
+            let own = ["Judgement", "Kind", "*", "blur", "pair"];
+            assert!(own.contains(&path.split("::").next().unwrap_or_default()), "super::{path}");
         }
     }
 }

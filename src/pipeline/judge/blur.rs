@@ -17,15 +17,15 @@ pub(crate) struct BlurEvidence {
 
 impl BlurEvidence {
     /// How much better the motion explains the frame than the better of one pose and nothing at all: a motion that explains less than nothing is none.
-    fn value(&self) -> f64 {
+    pub fn value(&self) -> f64 {
         self.still.min(self.blank)
     }
 }
 
 /// Logarithm of the ratio above which a frame moved.
-const MOVED: f64 = 0.10;
+pub(super) const MOVED: f64 = 0.10;
 /// Standard errors by which it has to be above 0.
-const SIGNIFICANT: f64 = 2.0;
+pub(super) const SIGNIFICANT: f64 = 2.0;
 /// Stroke in pixels below which a blur is none: what the denoised scene is sharper or softer than the frame passes for one of up to that.
 const NONE: f64 = 1.5;
 /// Logarithm of the ratio below which no motion explains more than nothing does.
@@ -35,13 +35,6 @@ impl BlurEvidence {
     fn line(&self) -> f64 {
         MOVED.max(SIGNIFICANT * self.still_error)
     }
-}
-
-/// Of what several sizes of a frame say, that which says most clearly that it moved.
-pub(crate) fn strongest(all: impl Iterator<Item = BlurEvidence>) -> Option<BlurEvidence> {
-    // A blur of no length is none, however clear.
-    let clear = |e: &BlurEvidence| if e.stroke > NONE { e.value() / e.line() } else { 0.0 };
-    all.max_by(|a, b| clear(a).total_cmp(&clear(b)))
 }
 
 /// The judgement of a frame of which a motion was found.
@@ -80,15 +73,6 @@ mod tests {
         assert_eq!(kind(2.1, 0.3, -0.6, 14.0), Kind::Stationary, "it explains less than nothing does");
         assert_eq!(kind(0.4, 0.25, 1.0, 5.0), Kind::Stationary, "by chance");
         assert_eq!(kind(0.6, 0.1, 2.2, 1.0), Kind::Stationary, "a blur of a pixel is what denoising makes of sharp frames");
-    }
-
-    #[test]
-    fn the_size_that_tells_most_decides() {
-        let fine = BlurEvidence { still: 0.4, still_error: 0.1, blank: -0.5, stroke: 30.0 };
-        let coarse = BlurEvidence { still: 0.9, still_error: 0.2, blank: 1.2, stroke: 20.0 };
-        assert_eq!(blurred(&strongest([fine, coarse].into_iter()).unwrap()).kind, Kind::Moved);
-        assert_eq!(blurred(&strongest([fine].into_iter()).unwrap()).kind, Kind::Stationary);
-        assert!(strongest(std::iter::empty()).is_none());
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! What the frames are, decided from numbers alone: no image, no device, no report. Each judgement says what was compared, the line and the margin.
 
 mod blur;
+mod pair;
 
-pub(super) use blur::{BlurEvidence, blurred, is_other_scene, strongest};
+pub(super) use blur::{BlurEvidence, blurred, is_other_scene};
+pub(super) use pair::Pair;
 
 use serde::Serialize;
 
@@ -45,9 +47,9 @@ impl Judgement {
         Self { kind, compared: "option", value: None, line: None, margin: None, reason: reason.into() }
     }
 
-    /// The frame beside which the others are judged first.
-    pub fn anchor() -> Self {
-        let reason = "the shortest frame that shows enough; the others are judged beside it".into();
+    /// The frame that is taken for stationary before any other.
+    pub fn first() -> Self {
+        let reason = "the shortest frame that shows enough, and no other shows that it moved".into();
         Self { kind: Kind::Stationary, compared: "exposure time", value: None, line: None, margin: None, reason }
     }
 
@@ -61,4 +63,15 @@ impl Judgement {
     pub fn by(kind: Kind, compared: &'static str, value: f64, line: f64, reason: String) -> Self {
         Self { kind, compared, value: Some(value), line: Some(line), margin: Some((value - line).abs()), reason }
     }
+}
+
+/// The judgement of the only stationary frame of a bracket after it was asked whether it moved as well: its own blur where all frames may move has a stroke of so many pixels, which
+/// counts from `line` on. Where that is `founded`, the joint estimate of all blurs decides.
+pub(super) fn doubted(stroke_px: f64, line: f64, founded: bool) -> Judgement {
+    let reason = if founded {
+        format!("the estimate of all blurs, of which its own would have {stroke_px:.1} px, does not explain the frames better")
+    } else {
+        "no blur of its own explains the frames better".into()
+    };
+    Judgement::by(Kind::Stationary, "stroke in pixels of its own blur where all frames may move", stroke_px, line, reason)
 }
