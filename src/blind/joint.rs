@@ -520,8 +520,9 @@ fn from_start(level: &Level, start: &Start, still: Option<usize>, going: &mut dy
 pub struct Doubt {
     /// Its blur where all frames may move, in pixels: length of an even stroke of the standard deviation along the blur beyond that across it. A soft lens has none.
     pub stroke_px: f64,
-    /// ln of each frame's squared residual where it did not move over that where it did, on pixels that no part of the estimate has seen; none where it has no stroke.
-    pub explained: Vec<f64>,
+    /// ln of the squared residual where it did not move over that where it did, on pixels that no part of the estimate has seen: of the frame itself and the mean of all; 0 where it has
+    /// no stroke.
+    pub explained: (f64, f64),
 }
 
 /// Stroke in pixels from which a frame that was taken for stationary may have moved: behind soft lenses, sharp frames of random brackets had up to 1.1, frames blurred by 3 to 4 px from
@@ -529,10 +530,9 @@ pub struct Doubt {
 pub const STROKE: f64 = 1.25;
 
 impl Doubt {
-    /// Whether it is worth to estimate all blurs together: a fifth of the residual at least goes.
+    /// Whether it is worth to estimate all blurs together: a fifth of the residual at least goes, of the frame itself and in the mean.
     pub fn is_founded(&self) -> bool {
-        let mean = self.explained.iter().sum::<f64>() / self.explained.len().max(1) as f64;
-        self.stroke_px > STROKE && mean > (1.0f64 / 0.8).ln()
+        self.stroke_px > STROKE && self.explained.0.min(self.explained.1) > (1.0f64 / 0.8).ln()
     }
 }
 
@@ -545,11 +545,13 @@ pub fn doubt(frames: &[Frame], start: &Start, going: &mut dyn FnMut() -> bool) -
     let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
     let stroke_px = (12.0 * beyond).sqrt() * level.scale as f64;
     if stroke_px <= STROKE {
-        return Some(Doubt { stroke_px, explained: Vec::new() });
+        return Some(Doubt { stroke_px, explained: (0.0, 0.0) });
     }
     let still = from_start(&level, start, Some(start.reference), going)?;
-    let ratio = |(still, moved): (&f64, &f64)| (still.max(1e-6) / moved.max(1e-6)).ln();
-    Some(Doubt { stroke_px, explained: level.judge(&still).iter().zip(&level.judge(&moved)).map(ratio).collect() })
+    let (still, moved) = (level.judge(&still), level.judge(&moved));
+    let ln = |still: f64, moved: f64| (still.max(1e-6) / moved.max(1e-6)).ln();
+    let own = ln(still[start.reference], moved[start.reference]);
+    Some(Doubt { stroke_px, explained: (own, ln(geometric_mean(&still), geometric_mean(&moved))) })
 }
 
 /// `state` of the level `from` on the next finer one, `level`, and `rounds` on from there. `None` as for [`at_coarsest`].
@@ -759,5 +761,14 @@ mod tests {
         assert!(after <= before, "from the true TSFs: {before:.3}, then {after:.3}");
         let [before, after] = residuals(0.6);
         assert!(after < 0.7 * before, "from short ones: {before:.3}, then {after:.3}");
+    }
+
+    #[test]
+    fn a_doubt_needs_a_stroke_and_a_frame_that_is_explained_itself() {
+        let founded = |stroke_px: f64, own: f64, all: f64| Doubt { stroke_px, explained: (own, all) }.is_founded();
+        assert!(founded(2.0, 0.7, 0.3));
+        assert!(!founded(0.8, 0.7, 0.3), "a soft lens");
+        assert!(!founded(2.0, 0.03, 1.0), "the others are explained better, not the frame that is in doubt");
+        assert!(!founded(2.0, 0.7, 0.1), "at the others' expense");
     }
 }

@@ -162,8 +162,14 @@ impl Run<'_> {
     }
 
     /// The joint estimate of irradiance and the TSFs of all of the frames `used`; `None` where it explains pixels that it was not fitted to no better than what is known
-    /// without it: a scene and the TSFs under it (`known`), or a merge.
-    pub(super) fn joint(&mut self, used: &[usize], known: Option<(&Rgb, &[Option<Tsf>])>, from: f32, to: f32) -> Result<Option<Found>> {
+    /// without it: a merge, or what is `known` of a scene, the TSFs under it and the frame that was taken for stationary, which itself has to be explained better.
+    pub(super) fn joint(
+        &mut self,
+        used: &[usize],
+        known: Option<(&Rgb, &[Option<Tsf>], usize)>,
+        from: f32,
+        to: f32,
+    ) -> Result<Option<Found>> {
         let channels = self.most_telling(used, used);
         let (frames, merged) = (self.luminance_frames(used, channels), self.blurred_merge(used));
         let names: Vec<String> = used.iter().map(|&i| self.bracket.frames()[i].name.clone()).collect();
@@ -183,7 +189,8 @@ impl Run<'_> {
         let (joint, alone) = (blind::geometric_mean(&found.held_out), blind::geometric_mean(&found.held_out_merge));
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
-        let believed = joint < EXPLAINED * alone;
+        let first = known.and_then(|k| used.iter().position(|&i| i == k.2));
+        let believed = joint < EXPLAINED * alone && first.is_none_or(|k| found.held_out[k] < EXPLAINED * found.held_out_merge[k]);
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],

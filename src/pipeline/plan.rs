@@ -164,7 +164,7 @@ impl Run<'_> {
     fn take_all_blurs(&mut self, state: &mut State) -> Result<()> {
         let used = state.all();
         let (scene, tsfs) = (state.latent.take(), state.tsfs.clone());
-        let known = scene.as_ref().map(|scene| (scene, tsfs.as_slice()));
+        let known = scene.as_ref().zip(state.still.first()).map(|(scene, &first)| (scene, tsfs.as_slice(), first));
         if self.settings.blind == Blind::Patches {
             self.memo.depends(&(self.settings.psf_radius, self.settings.patch_size));
         }

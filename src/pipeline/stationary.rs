@@ -58,8 +58,10 @@ impl Run<'_> {
                 let Some(&beside) = self.by_exposure_from(i, &still).first() else { break };
                 self.progress("looking which frames moved", 0.04 + 0.05 * i as f32 / placed.len() as f32)?;
                 let pair = self.compared(state, &used, &mut scenes, i, beside)?;
-                if attempt < FIRSTS && pair.other_moved() {
-                    state.judgements[beside] = Some(pair.of_other());
+                if attempt < FIRSTS
+                    && let Some(moved) = pair.other_moved()
+                {
+                    state.judgements[beside] = Some(moved);
                     sharper = Some(i);
                     break;
                 }

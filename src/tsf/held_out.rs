@@ -9,11 +9,11 @@ use std::collections::BTreeMap;
 
 /// Sides of the blocks that are held out, as a part of the longer side.
 const BLOCKS: usize = 14;
-/// Radii in pixels of the squares whose means stand for what differs between two pictures that no motion made: edges softened or sharpened by lens, noise reduction and engine;
-/// veiling glare around what is bright.
-const RADII: [usize; 2] = [1, 8];
-/// Shares that these may have: the first may sharpen as well, glare takes some per cent of a light at most.
-const SHARES: [(f64, f64); 2] = [(-1.0, 1.0), (0.0, 0.1)];
+/// Radii in pixels of the squares whose means stand for what differs between two pictures that no motion made: edges softened or sharpened by lens, noise reduction and engine, the
+/// first two; veiling glare around what is bright, the third.
+const RADII: [usize; 3] = [1, 2, 8];
+/// Shares that these may have: the first two may sharpen as well, glare takes some per cent of a light at most.
+const SHARES: [(f64, f64); 3] = [(-1.0, 1.0), (-1.0, 1.0), (0.0, 0.1)];
 
 /// Differences of a frame to fit to and, in every fifth block of it, to judge by.
 pub(super) struct HeldOut {
@@ -160,11 +160,13 @@ mod tests {
 
     #[test]
     fn shares_are_those_that_columns_were_mixed_with_within_their_bounds() {
-        let columns: Vec<Vec<f32>> = (0..3).map(|k| (0..400).map(|i| scattered(k, i)).collect()).collect();
-        let mixed = |by: [f32; 3]| -> Vec<f32> { (0..400).map(|i| (0..3).map(|k| by[k] * columns[k][i]).sum()).collect() };
-        for (by, expected) in
-            [([1.1, -0.4, 0.05], [1.1, -0.4, 0.05]), ([0.9, 0.3, 0.4], [0.9, 0.3, 0.1]), ([1.0, -1.6, -0.3], [1.0, -1.0, 0.0])]
-        {
+        let columns: Vec<Vec<f32>> = (0..4).map(|k| (0..400).map(|i| scattered(k, i)).collect()).collect();
+        let mixed = |by: [f32; 4]| -> Vec<f32> { (0..400).map(|i| (0..4).map(|k| by[k] * columns[k][i]).sum()).collect() };
+        for (by, expected) in [
+            ([1.1, -0.4, 0.2, 0.05], [1.1, -0.4, 0.2, 0.05]),
+            ([0.9, 0.3, 0.1, 0.4], [0.9, 0.3, 0.1, 0.1]),
+            ([1.0, -1.6, 0.0, -0.3], [1.0, -1.0, 0.0, 0.0]),
+        ] {
             let found = shares(&columns, &mixed(by));
             // The columns are not quite at right angles: what a bound keeps back goes into the others.
             let tolerance = if by == expected { 1e-4 } else { 0.1 };

@@ -219,7 +219,6 @@ fn judgements(found: &Outcome) -> Vec<&serde_json::Value> {
 
 /// Beside a sharp frame a blur of four pixels is found.
 #[test]
-#[ignore = "a tremor of 4 px beside a sharp frame is judged stationary"]
 fn a_slightly_shaken_frame_is_found_beside_a_sharp_one() {
     let slight = Tremor { extent_px: 4.0, roll_deg: 0.4, offset_px: 0.5, offset_deg: 0.0 };
     let shaken = Tremor { extent_px: 10.0, roll_deg: 0.8, ..slight.clone() };

@@ -17,15 +17,15 @@ pub(crate) struct BlurEvidence {
 
 impl BlurEvidence {
     /// How much better the motion explains the frame than the better of one pose and nothing at all: a motion that explains less than nothing is none.
-    pub fn value(&self) -> f64 {
+    pub(super) fn value(&self) -> f64 {
         self.still.min(self.blank)
     }
 }
 
 /// Logarithm of the ratio above which a frame moved.
-pub(super) const MOVED: f64 = 0.10;
+const MOVED: f64 = 0.10;
 /// Standard errors by which it has to be above 0.
-pub(super) const SIGNIFICANT: f64 = 2.0;
+const SIGNIFICANT: f64 = 2.0;
 /// Stroke in pixels below which a blur is none: what the denoised scene is sharper or softer than the frame passes for one of up to that.
 const NONE: f64 = 1.5;
 /// Logarithm of the ratio below which no motion explains more than nothing does.
