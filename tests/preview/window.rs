@@ -150,7 +150,7 @@ fn frames_are_dropped_probed_zoomed_and_moved() {
 
 /// One solution, and everything that needs one: a device and a solve are dear.
 #[test]
-#[ignore = "the shaken frame of the tiny bracket is judged stationary: its blur does not show beside noise and mosaic of so few pixels"]
+#[ignore = "the shaken frame of the tiny bracket is judged stationary"]
 fn a_bracket_is_solved_compared_nudged_and_exported_as_merge_would() {
     let (folder, files) = bracket();
     let mut window = Window::open(&files);
@@ -322,7 +322,7 @@ fn pixels(path: &Path) -> Vec<Vec<f32>> {
 }
 
 #[test]
-#[ignore = "the shaken frame of the tiny bracket is judged stationary: its blur does not show beside noise and mosaic of so few pixels"]
+#[ignore = "the shaken frame of the tiny bracket is judged stationary"]
 fn a_parameter_runs_only_the_stages_that_it_touches() {
     let (folder, files) = bracket();
     let session = folder.path().join("s.json");
