@@ -298,12 +298,8 @@ impl Level {
 
     /// One round: luminance, then all TSFs, then the free warp. With `draws` the TSFs are fitted to one of the scenes that the data allow, not to the
     /// smoothest, which is the best luminance: it is blurred, and TSFs that make up for that are too short, round by round.
-    fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>) {
-        self.round_beside(state, smoothness, model_error, draws, None);
-    }
-
-    /// [`Level::round`]; the frame `still` does not move.
-    fn round_beside(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>, still: Option<usize>) {
+    /// The frame `still` does not move.
+    fn round(&self, state: &mut State, smoothness: f32, model_error: f32, draws: Option<&mut Random>, still: Option<usize>) {
         let operators = self.solve(state, smoothness, model_error, 2);
         let drawn = draws.map(|random| {
             let effort = Effort { lambda: LAMBDA * smoothness, outer: 1, inner: DRAWN.0, model_error, lens_px: self.lens_px };
@@ -506,7 +502,7 @@ fn from_start(level: &Level, start: &Start, still: Option<usize>, going: &mut dy
     let mut state = level.begin(start);
     for k in 0..ROUNDS.0 {
         let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-        level.round_beside(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None, still);
+        level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None, still);
         if !going() {
             return None;
         }
@@ -529,10 +525,13 @@ pub struct Doubt {
 /// 1.5.
 pub const STROKE: f64 = 1.25;
 
+/// Squared residual where all frames moved over that of what is known without it, on pixels that no part of the estimate has seen, below which it is believed that they did.
+pub const EXPLAINED: f64 = 0.8;
+
 impl Doubt {
-    /// Whether it is worth to estimate all blurs together: a fifth of the residual at least goes, of the frame itself and in the mean.
+    /// Whether it is worth to estimate all blurs together: the residual falls below [`EXPLAINED`] of what it was, of the frame itself and in the mean.
     pub fn is_founded(&self) -> bool {
-        self.stroke_px > STROKE && self.explained.0.min(self.explained.1) > (1.0f64 / 0.8).ln()
+        self.stroke_px > STROKE && self.explained.0.min(self.explained.1) > -EXPLAINED.ln()
     }
 }
 
@@ -566,7 +565,7 @@ fn at_finer(
     let mut state = level.refine(state, from);
     for k in 0..rounds {
         let t = k as f32 / (rounds - 1) as f32;
-        level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), draws.as_deref_mut());
+        level.round(&mut state, between((SMOOTHNESS.1, 1.0), t), between(MODEL_ERROR, t), draws.as_deref_mut(), None);
         if !going() {
             return None;
         }
@@ -599,7 +598,7 @@ impl Look {
 fn drawn_at_coarsest(look: &Look, random: &mut Random, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let (level, mut state) = (&look.level, look.state.clone());
     for _ in 0..DRAWN_ROUNDS.0 {
-        level.round(&mut state, 1.0, MODEL_ERROR.1, Some(random));
+        level.round(&mut state, 1.0, MODEL_ERROR.1, Some(random), None);
         if !going() {
             return None;
         }

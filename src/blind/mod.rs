@@ -14,7 +14,9 @@ mod luminance;
 mod operator;
 mod patches;
 
-pub use joint::{Doubt, FittedTo, Joint, STROKE, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp, geometric_mean};
+pub use joint::{
+    Doubt, EXPLAINED, FittedTo, Joint, STROKE, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp, geometric_mean,
+};
 pub use luminance::{Frame, luminance_of};
 pub use operator::Operator;
 pub use patches::{Lack, PatchSetup, Patches, from_patches};

@@ -43,8 +43,6 @@ pub(super) struct Found {
     pub reduced: bool,
 }
 
-/// Held-out χ² of the joint estimate over that of what is known without it below which it is believed.
-const EXPLAINED: f64 = 0.8;
 impl Settings {
     /// How [`Blind::Patches`] looks at the patches.
     pub(crate) fn patch_setup(&self) -> PatchSetup {
@@ -190,7 +188,8 @@ impl Run<'_> {
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
         let first = known.and_then(|k| used.iter().position(|&i| i == k.2));
-        let believed = joint < EXPLAINED * alone && first.is_none_or(|k| found.held_out[k] < EXPLAINED * found.held_out_merge[k]);
+        let believed =
+            joint < blind::EXPLAINED * alone && first.is_none_or(|k| found.held_out[k] < blind::EXPLAINED * found.held_out_merge[k]);
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],

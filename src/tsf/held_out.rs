@@ -98,9 +98,10 @@ impl Filters {
         };
         let columns = |rows: &[Row]| -> Vec<Vec<f32>> {
             let sharp = predicted(frame.latent, rows);
-            let filtered = self.0.iter().map(|f| predicted(f, rows).iter().zip(&sharp).map(|(f, s)| f - s).collect());
-            let filtered: Vec<Vec<f32>> = filtered.collect();
-            std::iter::once(sharp.clone()).chain(filtered).collect()
+            let mut all: Vec<Vec<f32>> =
+                self.0.iter().map(|f| predicted(f, rows).iter().zip(&sharp).map(|(f, s)| f - s).collect()).collect();
+            all.insert(0, sharp);
+            all
         };
         let shares = shares(&columns(&held.inside), &frame.targets(&held.inside));
         let mut residual = frame.targets(&held.outside);

@@ -49,7 +49,7 @@ impl Judgement {
 
     /// The frame that is taken for stationary before any other.
     pub fn first() -> Self {
-        let reason = "the shortest frame that shows enough, and no other shows that it moved".into();
+        let reason = "the others are judged beside it, and none of them shows that it moved".into();
         Self { kind: Kind::Stationary, compared: "exposure time", value: None, line: None, margin: None, reason }
     }
 
