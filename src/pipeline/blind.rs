@@ -160,7 +160,7 @@ impl Run<'_> {
     }
 
     /// The joint estimate of irradiance and the TSFs of all of the frames `used`; `None` where it explains pixels that it was not fitted to no better than what is known
-    /// without it: a merge, or what is `known` of a scene, the TSFs under it and the frame that was taken for stationary, which itself has to be explained better.
+    /// without it: a merge, or what is `known` of a scene, the TSFs under it and the first frame that was taken for stationary, which itself has to be explained better.
     pub(super) fn joint(
         &mut self,
         used: &[usize],
@@ -217,9 +217,10 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// What speaks for it that the frame `first`, the only one of the frames `used` that is taken for stationary, moved as well; `None` where its edges are as hard as a sharp frame's.
-    pub(super) fn doubt(&mut self, first: usize, used: &[usize]) -> Result<Option<Doubt>> {
-        if !self.is_soft(first) {
+    /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved as well as all others; `None` where the edges of one of
+    /// these are as hard as a sharp frame's.
+    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize]) -> Result<Option<Doubt>> {
+        if !still.iter().all(|&i| self.is_soft(i)) {
             return Ok(None);
         }
         self.remembered(

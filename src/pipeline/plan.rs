@@ -67,7 +67,7 @@ impl Run<'_> {
             state.latent = Some(found.cropped());
         }
         self.estimate_blurs(&mut state)?;
-        self.doubt_the_first(&mut state)?;
+        self.doubt_the_stationary(&mut state)?;
         let base = self.base_again(&mut state, base)?;
         let solution = match self.rounds(&mut state, base.as_ref())? {
             Some(found) => found,
@@ -164,7 +164,7 @@ impl Run<'_> {
     fn take_all_blurs(&mut self, state: &mut State) -> Result<()> {
         let used = state.all();
         let (scene, tsfs) = (state.latent.take(), state.tsfs.clone());
-        let known = scene.as_ref().zip(state.still.first()).map(|(scene, &first)| (scene, tsfs.as_slice(), first));
+        let known = scene.as_ref().zip(self.first_reference(&state.still)).map(|(scene, first)| (scene, tsfs.as_slice(), first));
         if self.settings.blind == Blind::Patches {
             self.memo.depends(&(self.settings.psf_radius, self.settings.patch_size));
         }
@@ -199,15 +199,15 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Where all others moved beside the first frame and its own edges are soft, it may have moved as well: the joint estimate of all blurs, if that explains held-out pixels better.
-    fn doubt_the_first(&mut self, state: &mut State) -> Result<()> {
-        let [first] = state.still[..] else { return Ok(()) };
+    /// Where the edges of all frames that are taken for stationary are soft, all frames may have moved: the joint estimate of all blurs, if that explains held-out pixels better.
+    fn doubt_the_stationary(&mut self, state: &mut State) -> Result<()> {
+        let Some(first) = self.first_reference(&state.still) else { return Ok(()) };
         let asked = self.settings.blind == Blind::Auto && self.settings.sharp.is_none() && !state.given.contains(&true);
-        let explained = !state.shaken.is_empty() && state.shaken.iter().all(|&i| state.tsfs[i].is_some());
-        let doubt = if asked && explained { self.doubt(first, &state.all())? } else { None };
-        state.judgements[first] =
-            doubt.as_ref().map(|d| judge::doubted(d.stroke_px, blind::STROKE, d.is_founded())).or(state.judgements[first].take());
-        if doubt.is_some_and(|d| d.is_founded()) {
+        let explained = state.shaken.iter().all(|&i| state.tsfs[i].is_some());
+        let doubt = if asked && explained { self.doubt(first, &state.still, &state.all())? } else { None };
+        let Some(doubt) = doubt else { return Ok(()) };
+        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, blind::STROKE, doubt.is_founded()));
+        if doubt.is_founded() {
             self.take_all_blurs(state)?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
@@ -251,7 +251,15 @@ impl Run<'_> {
     /// What the stationary frames show once it is final which these are: `base`, unless one joined them since.
     fn base_again(&mut self, state: &mut State, base: Option<Solution>) -> Result<Option<Solution>> {
         let Some(base) = base.filter(|_| !state.still.is_empty()) else { return Ok(None) };
-        let base = if state.joined { self.solve_base(state)? } else { base };
+        if !state.joined {
+            state.latent = Some(base.cropped());
+            return Ok(Some(base));
+        }
+        if state.shaken.is_empty() {
+            // No TSF is about the reference that was: it is chosen anew among all that are stationary now.
+            state.latent = None;
+        }
+        let base = self.solve_base(state)?;
         state.latent = Some(base.cropped());
         Ok(Some(base))
     }
@@ -307,8 +315,9 @@ impl Run<'_> {
             let (tsf, detail, evidence) = self.remembered("blur", &own, |_| 0, look)?;
             (state.tsfs[i], state.details[i]) = (tsf, detail);
             let doubtful = std::mem::take(&mut self.registrations[i].doubtful);
-            match evidence {
-                Some(e) if !(doubtful && judge::is_other_scene(&e)) => {
+            // A motion that explains no more than nothing does is none: deblurred by it, its frame would spoil what the others show.
+            match evidence.filter(|e| !(doubtful || may_join) || !judge::explains_nothing(e)) {
+                Some(e) => {
                     if doubtful {
                         self.registrations[i].registered = true;
                         self.registrations[i].reason = "no part of it tells by itself where it lies; its blur does".into();

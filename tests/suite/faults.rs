@@ -437,3 +437,26 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
         assert_eq!((&frame["used"], &frame["sharp"]), (&true.into(), &true.into()), "{}: {}", frame["frame"], frame["judgement"]);
     }
 }
+
+/// A real pair: a frame of a phone drowned in noise beside a clean, shaken one. What of the blur is found beside noise explains less than nothing does, and ruins the
+/// clean frame.
+#[test]
+fn a_blur_that_explains_nothing_is_not_undone() {
+    let Some(folder) = shared("data/real") else { return };
+    let read = |(name, exposure_time): (&str, f64)| {
+        let picture = ldr::read(&folder.join(name)).unwrap();
+        Frame {
+            name: name.into(),
+            intensity: picture.intensity,
+            levels: picture.levels,
+            chroma_subsampled: picture.chroma_subsampled,
+            lossy: picture.lossy,
+            exposure_time,
+        }
+    };
+    let bracket = Bracket::new(vec![read(("noisy_2.jpg", 0.0118)), read(("blurred_2.jpg", 0.278))]).unwrap();
+    let found = pipeline::merge(&bracket, &response::automatic(&bracket).response, &Settings::default(), None, &mut |_| true).unwrap();
+    assert_eq!(found.left_out, vec![]);
+    let long = &found.report["frames"][1];
+    assert_eq!((&long["used"], &long["sharp"]), (&true.into(), &true.into()), "{}", long["judgement"]);
+}

@@ -28,7 +28,7 @@ const MOVED: f64 = 0.10;
 const SIGNIFICANT: f64 = 2.0;
 /// Stroke in pixels below which a blur is none: what the denoised scene is sharper or softer than the frame passes for one of up to that.
 const NONE: f64 = 1.5;
-/// Logarithm of the ratio below which no motion explains more than nothing does.
+/// Logarithm of the ratio below which no motion explains more than nothing does: blurs of random brackets came to 0.4 and more, one found beside a frame drowned in noise to -0.2.
 const NOTHING: f64 = 0.05;
 
 impl BlurEvidence {
@@ -53,8 +53,8 @@ pub(crate) fn blurred(e: &BlurEvidence) -> Judgement {
     Judgement::by(Kind::Stationary, compared, e.value(), line, reason)
 }
 
-/// Whether nothing that the scene shows is in the frame.
-pub(crate) fn is_other_scene(e: &BlurEvidence) -> bool {
+/// Whether the motion explains the frame no better than nothing does: the frame shows another scene, or what it is compared with is too noisy to tell.
+pub(crate) fn explains_nothing(e: &BlurEvidence) -> bool {
     e.blank < NOTHING
 }
 

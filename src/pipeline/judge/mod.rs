@@ -3,7 +3,7 @@
 mod blur;
 mod pair;
 
-pub(super) use blur::{BlurEvidence, blurred, is_other_scene};
+pub(super) use blur::{BlurEvidence, blurred, explains_nothing};
 pub(super) use pair::Pair;
 
 use serde::Serialize;
@@ -65,7 +65,7 @@ impl Judgement {
     }
 }
 
-/// The judgement of the only stationary frame of a bracket after it was asked whether it moved as well: its own blur where all frames may move has a stroke of so many pixels, which
+/// The judgement of the first stationary frame of a bracket after it was asked whether it moved as well: its own blur where all frames may move has a stroke of so many pixels, which
 /// counts from `line` on. Where that is `founded`, the joint estimate of all blurs decides.
 pub(super) fn doubted(stroke_px: f64, line: f64, founded: bool) -> Judgement {
     let reason = if founded {
