@@ -521,29 +521,33 @@ pub struct Doubt {
     pub explained: (f64, f64),
 }
 
-/// Stroke in pixels from which a frame that was taken for stationary may have moved: behind soft lenses, sharp frames of random brackets had up to 1.1, frames blurred by 3 to 4 px from
-/// 1.5.
+/// Stroke in pixels from which the only frame that was taken for stationary may have moved: behind soft lenses, sharp frames beside ones that moved had up to 1.1 in random brackets,
+/// frames blurred by 3 to 4 px from 1.5.
 pub const STROKE: f64 = 1.25;
+
+/// The same where several frames were: one that pairs of frames would show as well. Sharp frames of random brackets had up to 1.5 that was founded, frames that moved by 4 px and more from
+/// 4.4.
+pub const STROKE_OF_SEVERAL: f64 = 2.0;
 
 /// Squared residual where all frames moved over that of what is known without it, on pixels that no part of the estimate has seen, below which it is believed that they did.
 pub const EXPLAINED: f64 = 0.8;
 
 impl Doubt {
-    /// Whether it is worth to estimate all blurs together: the residual falls below [`EXPLAINED`] of what it was, of the frame itself and in the mean.
-    pub fn is_founded(&self) -> bool {
-        self.stroke_px > STROKE && self.explained.0.min(self.explained.1) > -EXPLAINED.ln()
+    /// Whether it is worth to estimate all blurs together: the stroke is longer than `stroke` and the residual falls below [`EXPLAINED`] of what it was, of the frame itself and in the mean.
+    pub fn is_founded(&self, stroke: f64) -> bool {
+        self.stroke_px > stroke && self.explained.0.min(self.explained.1) > -EXPLAINED.ln()
     }
 }
 
-/// Whether the frame of `start` may have moved as well as all others, as the coarsest level tells, whatever the size of the frames. `None` when `going` returns `false`, which it is asked
-/// after each round.
-pub fn doubt(frames: &[Frame], start: &Start, going: &mut dyn FnMut() -> bool) -> Option<Doubt> {
+/// Whether the frame of `start` may have moved, by a stroke longer than `stroke` in pixels, as well as all others, as the coarsest level tells, whatever the size of the frames. `None` when
+/// `going` returns `false`, which it is asked after each round.
+pub fn doubt(frames: &[Frame], start: &Start, stroke: f64, going: &mut dyn FnMut() -> bool) -> Option<Doubt> {
     let level = Level::new(frames, coarsest(frames), false);
     let moved = from_start(&level, start, None, going)?;
     let c = moved.tsfs[start.reference].covariance();
     let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
     let stroke_px = (12.0 * beyond).sqrt() * level.scale as f64;
-    if stroke_px <= STROKE {
+    if stroke_px <= stroke {
         return Some(Doubt { stroke_px, explained: (0.0, 0.0) });
     }
     let still = from_start(&level, start, Some(start.reference), going)?;
@@ -764,7 +768,7 @@ mod tests {
 
     #[test]
     fn a_doubt_needs_a_stroke_and_a_frame_that_is_explained_itself() {
-        let founded = |stroke_px: f64, own: f64, all: f64| Doubt { stroke_px, explained: (own, all) }.is_founded();
+        let founded = |stroke_px: f64, own: f64, all: f64| Doubt { stroke_px, explained: (own, all) }.is_founded(STROKE);
         assert!(founded(2.0, 0.7, 0.3));
         assert!(!founded(0.8, 0.7, 0.3), "a soft lens");
         assert!(!founded(2.0, 0.03, 1.0), "the others are explained better, not the frame that is in doubt");

@@ -15,7 +15,8 @@ mod operator;
 mod patches;
 
 pub use joint::{
-    Doubt, EXPLAINED, FittedTo, Joint, STROKE, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp, geometric_mean,
+    Doubt, EXPLAINED, FittedTo, Joint, STROKE, STROKE_OF_SEVERAL, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp,
+    geometric_mean,
 };
 pub use luminance::{Frame, luminance_of};
 pub use operator::Operator;

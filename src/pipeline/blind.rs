@@ -217,15 +217,15 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved as well as all others; `None` where the edges of one of
-    /// these are as hard as a sharp frame's.
-    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize]) -> Result<Option<Doubt>> {
+    /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved by more than `stroke` pixels as well as all others; `None` where
+    /// the edges of one of these are as hard as a sharp frame's.
+    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize], stroke: f64) -> Result<Option<Doubt>> {
         if !still.iter().all(|&i| self.is_soft(i)) {
             return Ok(None);
         }
         self.remembered(
             "doubt",
-            &format!("{first} {used:?}"),
+            &format!("{first} {used:?} {stroke}"),
             |_| 0,
             |run| {
                 let channels = run.most_telling(used, used);
@@ -233,7 +233,7 @@ impl Run<'_> {
                 let reference = used.iter().position(|&i| i == first).unwrap_or(0);
                 let start = Start { reference, luminance: run.alone(first, channels) };
                 let stage = format!("looking whether {} moved as well", run.bracket.frames()[first].name);
-                let found = blind::doubt(&frames, &start, &mut || run.progress(&stage, 0.40).is_ok());
+                let found = blind::doubt(&frames, &start, stroke, &mut || run.progress(&stage, 0.40).is_ok());
                 found.map(Some).ok_or(Error::Cancelled)
             },
         )

@@ -204,10 +204,11 @@ impl Run<'_> {
         let Some(first) = self.first_reference(&state.still) else { return Ok(()) };
         let asked = self.settings.blind == Blind::Auto && self.settings.sharp.is_none() && !state.given.contains(&true);
         let explained = state.shaken.iter().all(|&i| state.tsfs[i].is_some());
-        let doubt = if asked && explained { self.doubt(first, &state.still, &state.all())? } else { None };
+        let stroke = if state.still.len() == 1 { blind::STROKE } else { blind::STROKE_OF_SEVERAL };
+        let doubt = if asked && explained { self.doubt(first, &state.still, &state.all(), stroke)? } else { None };
         let Some(doubt) = doubt else { return Ok(()) };
-        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, blind::STROKE, doubt.is_founded()));
-        if doubt.is_founded() {
+        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, stroke, doubt.is_founded(stroke)));
+        if doubt.is_founded(stroke) {
             self.take_all_blurs(state)?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
