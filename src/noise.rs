@@ -2,8 +2,8 @@
 //!
 //! What counts for everything that averages pixels is the noise *density*: the variance of a mean of n pixels times n. A demosaiced pixel shares its noise with
 //! its neighbours, and a camera's engine smooths it further; the density stays what the sensor made it, while the variance of differences between
-//! neighbours falls to a tenth (green of a converter's file), to a three hundredth (JPEG). So the density is measured on means of squares of [`COARSE`]
-//! pixels as well as on pixels.
+//! neighbours falls to a tenth (green of a converter's file), to a three hundredth (JPEG). So the density is measured on means of squares of [`MIDDLE`] and
+//! [`COARSE`] pixels as well as on pixels.
 
 use crate::exposure::Frame;
 use crate::image::{Channels, Plane, Rgb};
@@ -181,10 +181,17 @@ const BLACK: f64 = 0.2;
 
 /// Side of the blocks whose variance is measured: pixels, and means of squares of [`COARSE`] pixels.
 const BLOCK: usize = 8;
+const MIDDLE_BLOCK: usize = 4;
 const COARSE_BLOCK: usize = 3;
 /// Side in pixels of the squares whose means show the density of correlated noise: demosaicing and engines reach over about four pixels. On 24 random cameras
 /// the density of green comes out right in the median (a quarter of it to three times), at a side of 2 ten times too low.
 const COARSE: usize = 4;
+/// Side of those by which the correlation is told: texture weighs less there, a tenth on textured scenes, and demosaiced noise shows about half of its density.
+const MIDDLE: usize = 2;
+/// Powers of c, the density of white noise behind a Gaussian over what second differences of pixels show of it, that second differences of means of [`MIDDLE`]² pixels show: of the density,
+/// and over those of pixels (c from 5 to 300, computed from the spectra, within a tenth).
+const SHOWN: f64 = -0.37;
+const GROWTH: f64 = 1.0 + SHOWN;
 /// Ratio of the two densities up to which noise counts as white: texture lifts the coarse one by up to that; demosaiced noise has ten.
 const WHITE: f64 = 4.0;
 /// Blocks of one channel that are enough to tell the noise by, about.
@@ -192,9 +199,10 @@ const ENOUGH: usize = 60_000;
 /// Quantile of blocks that is taken for noise alone, as texture only ever adds.
 const FLATTEST: f64 = 0.05;
 /// That quantile of the mean square of so many squared samples of filtered white noise over its expectation (10⁶ simulated blocks).
-const OF_NOISE: [(usize, f64); 2] = [(BLOCK, 0.555), (COARSE_BLOCK, 0.214)];
-/// Most that correlation is believed to be: beyond, the finest structure is what compression left of it.
-const MOST_CORRELATED: f64 = 1000.0;
+const OF_NOISE: [(usize, f64); 3] = [(BLOCK, 0.555), (MIDDLE_BLOCK, 0.311), (COARSE_BLOCK, 0.214)];
+/// Most that correlation is believed to be: beyond, the finest structure is what compression left of it. With it, the density of green at [`MIDDLE`] is right in the median on files of
+/// random cameras' engines.
+const MOST_CORRELATED: f64 = 300.0;
 /// Blocks that a bin has at least.
 const FEWEST: usize = 30;
 /// Least variance at black as a part of that of the darkest blocks: nothing darker is free of clipping at black, so that a line through the samples may end
@@ -209,8 +217,9 @@ const ASSUMED: (f64, f64) = (2000.0, 5.0);
 
 /// Noise of each of `frames`, from the high-pass variance of its own flattest blocks at each exposure.
 ///
-/// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes. It is taken of pixels and of means of [`COARSE`]² pixels; where
-/// the second shows a density more than [`WHITE`] times that of the first in three quarters of the exposures, neighbours share their noise. Red and blue
+/// The high-pass is the difference of two Laplacians (Immerkær 1996), which removes planes. It is taken of pixels and of means of [`MIDDLE`]² and [`COARSE`]² pixels; where
+/// both others show a density more than [`WHITE`] times that of the first in three quarters of the exposures, neighbours share their noise. The density is then the lower one of what the
+/// second shows, over the part that it shows of it, and of what the third shows: texture lifts either. Red and blue
 /// sites are half as many as green ones and their gain is higher: where noise is correlated their density is at least green's, as chroma
 /// is smoothed over more pixels than a square has.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> Vec<FrameNoise> {
@@ -233,26 +242,40 @@ fn of_frame(frame: &Frame, exposure: &Rgb, response: &Response) -> FrameNoise {
     let of_mean = |side: usize, block: usize| samples(&mean, &of_all, side, block, &rounding);
     let model = |s: &[Sample]| fit(s, BELOW).map(|m| floored(m, s));
     let assumed = NoiseModel::from_electrons(ASSUMED.0, ASSUMED.1);
-    let [fine, coarse] = [of_mean(1, BLOCK), of_mean(COARSE, COARSE_BLOCK)].map(|s| (model(&s), s));
+    let [fine, middle, coarse] = [of_mean(1, BLOCK), of_mean(MIDDLE, MIDDLE_BLOCK), of_mean(COARSE, COARSE_BLOCK)];
+    let white = model(&fine);
     let lower_quartile = |mut v: Vec<f64>| {
         v.sort_by(f64::total_cmp);
         v.get(v.len() / 4).copied()
     };
-    let over =
-        |m: &Option<NoiseModel>| m.and_then(|m| lower_quartile(coarse.1.iter().map(|s| s.variance / m.variance(s.exposure)).collect()));
-    let correlation = over(&fine.0).unwrap_or(1.0);
+    let over_fine = |s: &[Sample]| white.and_then(|m| lower_quartile(s.iter().map(|s| s.variance / m.variance(s.exposure)).collect()));
+    let told = |s: &[Sample]| over_fine(s).map_or(1.0, |r: f64| r.max(1.0));
+    let correlation = told(&coarse).min(told(&middle).powf(1.0 / GROWTH)).min(MOST_CORRELATED);
     if correlation < WHITE {
-        let white: [Option<NoiseModel>; 3] = std::array::from_fn(|c| model(&of_channel(c, 1, BLOCK)));
-        let any = white.iter().flatten().next().copied().unwrap_or(assumed);
-        let channels = white.map(|w| w.unwrap_or(any));
+        let channels: [Option<NoiseModel>; 3] = std::array::from_fn(|c| model(&of_channel(c, 1, BLOCK)));
+        let any = channels.iter().flatten().next().copied().unwrap_or(assumed);
+        let channels = channels.map(|w| w.unwrap_or(any));
         let third = NoiseModel { shot: any.shot / 3.0, read: any.read / 3.0 };
-        return FrameNoise { channels, luminance: fine.0.unwrap_or(third), correlation: 1.0 };
+        return FrameNoise { channels, luminance: white.unwrap_or(third), correlation: 1.0 };
     }
-    let luminance = coarse.0.unwrap_or(assumed);
-    let density: [Option<NoiseModel>; 3] = std::array::from_fn(|c| model(&of_channel(c, COARSE, COARSE_BLOCK)));
-    let green = density[1].or(density[0]).or(density[2]).unwrap_or(luminance);
-    let channels = density.map(|d| d.map_or(green, |d| NoiseModel { shot: d.shot.max(green.shot), read: d.read.max(green.read) }));
-    FrameNoise { channels, luminance, correlation: correlation.min(MOST_CORRELATED) }
+    // Texture lifts either.
+    let shown = correlation.powf(SHOWN);
+    let density = |middle: &[Sample], coarse: &[Sample]| {
+        let middle: Vec<Sample> = middle.iter().map(|s| Sample { variance: s.variance / shown, ..*s }).collect();
+        [model(&middle), model(coarse)].into_iter().flatten().min_by(|a, b| level(a, coarse).total_cmp(&level(b, coarse)))
+    };
+    let luminance = density(&middle, &coarse).unwrap_or(assumed);
+    let channels: [Option<NoiseModel>; 3] =
+        std::array::from_fn(|c| density(&of_channel(c, MIDDLE, MIDDLE_BLOCK), &of_channel(c, COARSE, COARSE_BLOCK)));
+    let green = channels[1].or(channels[0]).or(channels[2]).unwrap_or(luminance);
+    let channels = channels.map(|d| d.map_or(green, |d| NoiseModel { shot: d.shot.max(green.shot), read: d.read.max(green.read) }));
+    FrameNoise { channels, luminance, correlation }
+}
+
+/// Mean logarithm of the variance of `model` at the exposures of `samples`.
+fn level(model: &NoiseModel, samples: &[Sample]) -> f64 {
+    let blocks: f64 = samples.iter().map(|s| s.blocks).sum();
+    samples.iter().map(|s| s.blocks * model.variance(s.exposure).ln()).sum::<f64>() / blocks.max(1.0)
 }
 
 /// Which pixels are clear of white, and which read 0.
