@@ -131,6 +131,26 @@ fn smoothed_noise_keeps_its_density() {
     assert!(found[1..].iter().all(|f| f.correlation > 4.0), "{found:?}");
 }
 
+/// Texture that fills the picture, soft as a lens leaves it, is nearly all that means of 4 x 4 pixels show; noise shows at 2 x 2 already.
+#[test]
+fn texture_everywhere_is_not_taken_for_correlated_noise() {
+    let truth = noise::NoiseModel::from_electrons(20_000.0, 4.0);
+    let engine = |p: Plane| {
+        // What is left of noise between the sites of a mosaic.
+        let weight = |d: isize| if d == 0 { 0.5 } else { 0.25 };
+        Plane::from_fn(p.width, p.height, |x, y| {
+            let around = (-1..=1).flat_map(|j| (-1..=1).map(move |i| (i, j)));
+            let mean: f32 = around.map(|(i, j)| weight(i) * weight(j) * p.clamped(x as isize + i, y as isize + j)).sum();
+            let (x, y) = (x as f32, y as f32);
+            mean * (1.0 + 0.1 * ((0.55 * x + 0.2 * y).sin() + (0.5 * y - 0.25 * x).sin()))
+        })
+    };
+    let found = noise_of(&[flat_fields(&truth, 600, engine)])[0];
+    let ratio = found.channels[1].variance(0.3) / truth.variance(0.3);
+    println!("{ratio:.1} times the true density, correlation {:.1}", found.correlation);
+    assert!((0.3..4.0).contains(&ratio), "{ratio:.1} times the true density: {found:?}");
+}
+
 #[test]
 fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     for (z, expected) in [(0.0, 0.0), (0.075, 0.5), (0.15, 1.0), (0.5, 1.0), (0.85, 1.0), (0.925, 0.5), (1.0, 0.0)] {
