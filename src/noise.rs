@@ -179,7 +179,7 @@ fn is_clear(z: f32) -> bool {
 /// Part of a block's pixels that may read 0: noise clipped at black has lost little of its variance up to there, and a frame so noisy that every block holds some has no other.
 const BLACK: f64 = 0.2;
 
-/// Side of the blocks whose variance is measured: pixels, and means of squares of [`COARSE`] pixels.
+/// Side of the blocks whose variance is measured: of pixels, and of means of squares of [`MIDDLE`] and of [`COARSE`] pixels.
 const BLOCK: usize = 8;
 const MIDDLE_BLOCK: usize = 4;
 const COARSE_BLOCK: usize = 3;

@@ -207,8 +207,9 @@ impl Run<'_> {
         let stroke = if state.still.len() == 1 { blind::STROKE } else { blind::STROKE_OF_SEVERAL };
         let doubt = if asked && explained { self.doubt(first, &state.still, &state.all(), stroke)? } else { None };
         let Some(doubt) = doubt else { return Ok(()) };
-        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, stroke, doubt.is_founded(stroke)));
-        if doubt.is_founded(stroke) {
+        let founded = doubt.is_founded(stroke);
+        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, stroke, founded));
+        if founded {
             self.take_all_blurs(state)?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
@@ -252,15 +253,11 @@ impl Run<'_> {
     /// What the stationary frames show once it is final which these are: `base`, unless one joined them since.
     fn base_again(&mut self, state: &mut State, base: Option<Solution>) -> Result<Option<Solution>> {
         let Some(base) = base.filter(|_| !state.still.is_empty()) else { return Ok(None) };
-        if !state.joined {
-            state.latent = Some(base.cropped());
-            return Ok(Some(base));
-        }
-        if state.shaken.is_empty() {
+        if state.joined && state.shaken.is_empty() {
             // No TSF is about the reference that was: it is chosen anew among all that are stationary now.
             state.latent = None;
         }
-        let base = self.solve_base(state)?;
+        let base = if state.joined { self.solve_base(state)? } else { base };
         state.latent = Some(base.cropped());
         Ok(Some(base))
     }
