@@ -9,8 +9,13 @@ use crate::exposure::Frame;
 use crate::image::{Channels, Plane, Rgb};
 use crate::kernels::NOISE_STEPS;
 use crate::response::Response;
+use beside::Shown;
+use glam::DMat3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
+
+mod beside;
 
 /// Shot and read noise of a camera at one sensitivity, in units of the exposure (1 = white).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -198,6 +203,8 @@ const WHITE: f64 = 4.0;
 const ENOUGH: usize = 60_000;
 /// Quantile of blocks that is taken for noise alone, as texture only ever adds.
 const FLATTEST: f64 = 0.05;
+/// The same of blocks beside another frame, which leaves less texture.
+const FLATTEST_BESIDE: f64 = 0.2;
 /// That quantile of the mean square of so many squared samples of filtered white noise over its expectation (10⁶ simulated blocks).
 const OF_NOISE: [(usize, f64); 3] = [(BLOCK, 0.555), (MIDDLE_BLOCK, 0.311), (COARSE_BLOCK, 0.214)];
 /// Most that correlation is believed to be: beyond, the finest structure is what compression left of it. With it, the density of green at [`MIDDLE`] is right in the median on files of
@@ -223,23 +230,56 @@ const ASSUMED: (f64, f64) = (2000.0, 5.0);
 /// sites are half as many as green ones and their gain is higher: where noise is correlated their density is at least green's, as chroma
 /// is smoothed over more pixels than a square has.
 pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> Vec<FrameNoise> {
-    frames.par_iter().zip(exposures).map(|(f, x)| of_frame(f, x, response)).collect()
+    (0..frames.len()).into_par_iter().map(|i| of_frame(Shown { frame: &frames[i], exposure: &exposures[i] }, &[], response)).collect()
 }
 
-fn of_frame(frame: &Frame, exposure: &Rgb, response: &Response) -> FrameNoise {
+/// [`estimate`] of the frames `ids`, which lie at `motions` from the reference (centred pixels), by what the others of them leave of each as well: texture is in all of them. Of the other frames
+/// `known` stays.
+pub fn estimate_registered(
+    frames: &[Frame],
+    exposures: &[Rgb],
+    response: &Response,
+    (ids, motions): (&[usize], &[DMat3]),
+    known: &[FrameNoise],
+) -> Vec<FrameNoise> {
+    let shown = |i: usize| Shown { frame: &frames[i], exposure: &exposures[i] };
+    let mut found = known.to_vec();
+    let own = |&i: &usize| {
+        let back = motions[i].inverse();
+        let others: Vec<_> = ids.iter().filter(|&&k| k != i).map(|&k| (shown(k), motions[k] * back)).collect();
+        of_frame(shown(i), &others, response)
+    };
+    let estimates: Vec<FrameNoise> = ids.par_iter().map(own).collect();
+    for (&i, one) in ids.iter().zip(estimates) {
+        found[i] = one;
+    }
+    found
+}
+
+fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> FrameNoise {
+    let Shown { frame, exposure } = shown;
     let planes = &frame.intensity.0;
-    let all = |test: &(dyn Fn(f32) -> bool + Sync), c: std::ops::Range<usize>| -> Vec<bool> {
+    let all = |test: &(dyn Fn(f32) -> bool + Sync), c: Range<usize>| -> Vec<bool> {
         (0..planes[0].data.len()).into_par_iter().map(|p| c.clone().all(|c| test(planes[c].data[p]))).collect()
     };
-    let counts = |c: std::ops::Range<usize>| Counts { clear: all(&is_clear, c.clone()), black: all(&|z| z <= 0.0, c) };
+    let counts = |c: Range<usize>| Counts { clear: all(&is_clear, c.clone()), black: all(&|z| z <= 0.0, c) };
     let own: [Counts; 3] = std::array::from_fn(|c| counts(c..c + 1));
     let of_all = counts(0..3);
     let quantum: [_; 3] = std::array::from_fn(|c| quantisation(response, c, frame.levels));
-    let of_channel = |c: usize, side: usize, block: usize| samples(&exposure.0[c], &own[c], side, block, &quantum[c]);
     let mean = exposure.mean();
     // Rounding is independent in the channels.
     let rounding = |x: f64| quantum.iter().map(|q| q(x)).sum::<f64>() / 9.0;
-    let of_mean = |side: usize, block: usize| samples(&mean, &of_all, side, block, &rounding);
+    let beside = |channels: Range<usize>, side: usize, quantum: &(dyn Fn(f64) -> f64 + Sync)| -> Vec<Vec<Sample>> {
+        let &(_, block, of_noise) = beside::BLOCKS.iter().find(|b| b.0 == side).expect("a side that is looked at");
+        let one = |(other, motion): &(Shown, DMat3)| {
+            bins(beside::blocks(&shown, other, motion, &channels, (side, block), &quantum), FLATTEST_BESIDE, of_noise)
+        };
+        others.iter().map(one).collect()
+    };
+    let of_channel = |c: usize, side: usize, block: usize| {
+        lowest(samples(&exposure.0[c], &own[c], side, block, &quantum[c]), &beside(c..c + 1, side, &quantum[c]))
+    };
+    let of_mean = |side: usize, block: usize| lowest(samples(&mean, &of_all, side, block, &rounding), &beside(0..3, side, &rounding));
     let model = |s: &[Sample]| fit(s, BELOW).map(|m| floored(m, s));
     let assumed = NoiseModel::from_electrons(ASSUMED.0, ASSUMED.1);
     let [fine, middle, coarse] = [of_mean(1, BLOCK), of_mean(MIDDLE, MIDDLE_BLOCK), of_mean(COARSE, COARSE_BLOCK)];
@@ -288,7 +328,19 @@ struct Counts {
 fn samples(x: &Plane, counts: &Counts, side: usize, block: usize, quantum: &(impl Fn(f64) -> f64 + Sync)) -> Vec<Sample> {
     let (x, counts) = reduced(x, counts, side);
     let of_noise = OF_NOISE.iter().find(|o| o.0 == block).expect("a block that was simulated").1;
-    bins(collect_blocks(&x, &counts, block, side, quantum), of_noise)
+    bins(collect_blocks(&x, &counts, block, side, quantum), FLATTEST, of_noise)
+}
+
+/// `own` with the lowest variance that any of `beside` has at the same exposure, between two of its samples: texture lifts each.
+fn lowest(own: Vec<Sample>, beside: &[Vec<Sample>]) -> Vec<Sample> {
+    let at = |samples: &[Sample], x: f64| -> Option<f64> {
+        let k = samples.partition_point(|s| s.exposure < x);
+        let (below, above) = (samples.get(k.checked_sub(1)?)?, samples.get(k)?);
+        let part = (x / below.exposure).ln() / (above.exposure / below.exposure).ln();
+        Some((below.variance.ln() * (1.0 - part) + above.variance.ln() * part).exp())
+    };
+    let least = |s: Sample| beside.iter().filter_map(|b| at(b, s.exposure)).fold(s.variance, f64::min);
+    own.into_iter().map(|s| Sample { variance: least(s), ..s }).collect()
 }
 
 /// `model` with a variance at black that is not far below that of the darkest of `samples`.
@@ -322,7 +374,7 @@ fn reduced(x: &Plane, counts: &Counts, side: usize) -> (Plane, Vec<(bool, f32)>)
 
 /// Quantiles of bins along the exposure: as wide as a factor of 1.5, wider where that holds fewer than [`FEWEST`] blocks, of some hundred blocks at most. Within a bin
 /// variances are compared as those of shot noise, which grow with the exposure.
-fn bins(mut blocks: Vec<Sample>, of_noise: f64) -> Vec<Sample> {
+fn bins(mut blocks: Vec<Sample>, quantile: f64, of_noise: f64) -> Vec<Sample> {
     blocks.retain(|b| b.exposure > 0.0);
     blocks.sort_by(|a, b| a.exposure.total_cmp(&b.exposure));
     let mut samples = Vec::new();
@@ -337,7 +389,7 @@ fn bins(mut blocks: Vec<Sample>, of_noise: f64) -> Vec<Sample> {
         let exposure = part.iter().map(|b| b.exposure).sum::<f64>() / part.len() as f64;
         let mut v: Vec<f64> = part.iter().map(|b| b.variance * exposure / b.exposure).collect();
         v.sort_by(f64::total_cmp);
-        let variance = v[(FLATTEST * v.len() as f64) as usize] / of_noise;
+        let variance = v[(quantile * v.len() as f64) as usize] / of_noise;
         if variance > 0.0 {
             samples.push(Sample { exposure, variance, blocks: part.len() as f64 });
         }

@@ -4,7 +4,8 @@ use super::Run;
 use crate::error::Result;
 use crate::image::Channels;
 use crate::mask;
-use crate::photometry::FramePhotometry;
+use crate::noise::FrameNoise;
+use crate::photometry::{self, FramePhotometry};
 use crate::register::{self, Registrar, Registration};
 use glam::DMat3;
 
@@ -21,6 +22,7 @@ pub(super) struct Placed {
     pub excluded: Vec<bool>,
     pub motions: Vec<DMat3>,
     pub registrations: Vec<Registration>,
+    pub noise: Vec<FrameNoise>,
     pub photometry: Vec<FramePhotometry>,
     pub left_out: Vec<(String, String)>,
     pub degraded: Vec<String>,
@@ -39,7 +41,8 @@ impl Run<'_> {
             }
         }
         let placed: Vec<usize> = used.iter().copied().filter(|&i| found[i].registered).collect();
-        self.match_photometry(&placed);
+        let noise = self.noise_beside_each_other(&placed);
+        let photometry = photometry::photometry(self.bracket.frames(), &self.exposures, &noise, &placed, &self.motions);
         let mut excluded = excluded.to_vec();
         for &i in used.iter().filter(|&&i| !found[i].registered) {
             if !found[i].doubtful {
@@ -51,7 +54,8 @@ impl Run<'_> {
             excluded,
             motions: self.motions.clone(),
             registrations: found,
-            photometry: self.photometry.clone(),
+            noise,
+            photometry,
             left_out: self.left_out.clone(),
             degraded: self.degraded.clone(),
         })

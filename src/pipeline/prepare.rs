@@ -80,11 +80,12 @@ impl Run<'_> {
         self.warn(format!("the frames' pixels contradict the noted exposures: {}; they are merged as the pixels have it", texts.join(", ")))
     }
 
-    /// Gains and black levels of the frames `ids` where they lie, taken off the exposures from here on.
-    pub(super) fn match_photometry(&mut self, ids: &[usize]) {
-        let frames = self.bracket.frames();
-        let found = photometry::photometry(frames, &self.exposures, &self.noise, ids, &self.motions);
-        self.take_photometry(found);
+    /// Noise of the exposures as the files have them, by what the frames `ids`, where they lie, leave of each other; as given where the user gave it.
+    pub(super) fn noise_beside_each_other(&self, ids: &[usize]) -> Vec<FrameNoise> {
+        if self.settings.noise.is_some() {
+            return self.noise.clone();
+        }
+        noise::estimate_registered(self.bracket.frames(), &self.exposures, self.response, (ids, &self.motions), &self.noise)
     }
 
     /// Standard deviations of the exposures by noise and rounding alone.
@@ -109,8 +110,9 @@ impl Run<'_> {
         self.curves_under(&self.noise.iter().map(FrameNoise::of_detail).collect::<Vec<_>>())
     }
 
-    /// `found` as the photometry of exposures that are as the files have them.
-    pub(super) fn take_photometry(&mut self, found: Vec<photometry::FramePhotometry>) {
+    /// `noise` and `found` as noise and photometry of exposures that are as the files have them; from here on gain and black are taken off these.
+    pub(super) fn take_photometry(&mut self, noise: Vec<FrameNoise>, found: Vec<photometry::FramePhotometry>) {
+        self.noise = noise;
         for (i, one) in found.iter().enumerate() {
             if *one != photometry::FramePhotometry::AS_NOTED {
                 self.exposures[i] = one.corrected(&self.exposures[i]);

@@ -22,7 +22,7 @@ const TABLE: Table = &[
     ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
     ("response", &["error", "image", "exposure", "mask::CLIPPED", "noise", "robust::precision"]),
-    ("noise", &["image", "exposure", "response::Response", "kernels::NOISE_STEPS"]),
+    ("noise", &["image", "exposure", "pose::project", "response::Response", "kernels::NOISE_STEPS"]),
     ("photometry", &["image::Rgb", "exposure::Frame", "mask::CLIPPED", "noise::FrameNoise", "pose::project", "robust::precision"]),
     ("mask", &["image", "exposure", "pose"]),
     ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),

@@ -151,6 +151,48 @@ fn texture_everywhere_is_not_taken_for_correlated_noise() {
     assert!((0.3..4.0).contains(&ratio), "{ratio:.1} times the true density: {found:?}");
 }
 
+/// Texture that fills the picture, with no flat part at all, is in both frames of a bracket: what the other frame shows of it is not noise. The frames lie apart by parts of a pixel, one of
+/// them is blurred, and their gains differ.
+#[test]
+fn texture_that_another_frame_shows_is_not_noise() {
+    let (w, h) = (288, 216);
+    let truth = [(3000.0, 6.0), (12_000.0, 4.0), (1500.0, 6.0)].map(|(full_well, read)| noise::NoiseModel::from_electrons(full_well, read));
+    let waves: Vec<[f32; 4]> = numbers(700, 40 * 4).chunks(4).map(|c| [1.2 * c[0], 1.2 * c[1], 10.0 * c[2], c[3]]).collect();
+    let scene = |x: f32, y: f32| {
+        let texture: f32 = waves.iter().map(|w| 0.02 * (w[0] * x + w[1] * y + w[2]).sin()).sum();
+        (0.1 + 0.3 * x / w as f32) * (1.0 + texture).max(0.2)
+    };
+    // Displacement, gain, and length of a stroke along x.
+    let frame = |k: usize, (dx, dy): (f32, f32), gain: f32, stroke: i32| {
+        let plane = |c: u64| {
+            let n = twelve(800 + 100 * k as u64 + 20 * c, w * h);
+            Plane::from_fn(w, h, |x, y| {
+                let at = |i: i32| scene(x as f32 + dx + i as f32 - 0.5 * (stroke - 1) as f32, y as f32 + dy);
+                let e = gain * (0..stroke).map(at).sum::<f32>() / stroke as f32;
+                (e + truth[k].variance(f64::from(e)).sqrt() as f32 * n[y * w + x] / 2.0).clamp(0.0, 1.0)
+            })
+        };
+        let intensity = Rgb([plane(0), plane(1), plane(2)]);
+        Frame { name: k.to_string(), intensity, levels: 65535, chroma_subsampled: false, lossy: false, exposure_time: f64::from(gain) }
+    };
+    let places = [(0.0f32, 0.0f32), (5.5, -3.25), (-4.3, 2.6)];
+    let frames = [frame(0, places[0], 1.0, 1), frame(1, places[1], 1.4, 1), frame(2, places[2], 1.2, 6)];
+    let motions = places.map(|(x, y)| DMat3::from_translation(-glam::DVec2::new(f64::from(x), f64::from(y))));
+    let exposures: Vec<Rgb> = frames.iter().map(|f| noise::exposure(f, &Response::Linear)).collect();
+    let alone = noise_of(&frames);
+    let beside = noise::estimate_registered(&frames, &exposures, &Response::Linear, (&[0, 1, 2], &motions), &alone);
+    let ratio = |k: usize, n: &noise::FrameNoise| n.channels[1].variance(0.25) / truth[k].variance(0.25);
+    for k in 0..3 {
+        println!("frame {k}: {:.2} times the truth alone, {:.2} beside the others", ratio(k, &alone[k]), ratio(k, &beside[k]));
+    }
+    assert!(ratio(0, &alone[0]) > 3.0, "the texture has to pass for noise in a frame alone");
+    for k in [0, 2] {
+        assert!((0.7..1.6).contains(&ratio(k, &beside[k])), "frame {k}: {:.2} times the true noise", ratio(k, &beside[k]));
+    }
+    // Beside noisier frames some texture is left of the cleanest.
+    assert!(ratio(1, &beside[1]) < 0.4 * ratio(1, &alone[1]), "{:.2} times the true noise", ratio(1, &beside[1]));
+}
+
 #[test]
 fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
     for (z, expected) in [(0.0, 0.0), (0.075, 0.5), (0.15, 1.0), (0.5, 1.0), (0.85, 1.0), (0.925, 0.5), (1.0, 0.0)] {

@@ -1,0 +1,121 @@
+//! Noise of a frame's blocks by what another frame of the same scene leaves of them.
+//!
+//! Both frames show the texture, and each has its own noise. Within a block of means of squares of pixels the frame is a linear function of the other one's squares around the same place:
+//! gain, black, a displacement by part of a square, sharpening and blur are all such functions. What least squares leave is the frame's noise, some of the other's, and texture that the
+//! other does not show: never less than the frame's noise.
+
+use super::{BLACK, ENOUGH, Sample, is_clear};
+use crate::exposure::Frame;
+use crate::image::Rgb;
+use crate::pose::project;
+use glam::{DMat3, DVec2};
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Unknowns of a block: 3 x 3 squares of the other frame, a constant and slopes along x and y.
+const UNKNOWNS: usize = 12;
+/// Added to the diagonal of the normal equations of unit regressors: what the other frame shows nothing of stays 0.
+const RIDGE: f64 = 1e-9;
+/// Side of the blocks of means of squares of 1, 2 and 4 pixels, and the quantile [`super::FLATTEST_BESIDE`] of the mean square of their residuals over its expectation: that of χ² over its degrees of
+/// freedom, side² - [`UNKNOWNS`].
+pub(super) const BLOCKS: [(usize, usize, f64); 3] = [(1, 12, 0.895), (2, 8, 0.835), (4, 6, 0.753)];
+
+/// A frame and its exposures.
+#[derive(Clone, Copy)]
+pub(super) struct Shown<'a> {
+    pub frame: &'a Frame,
+    pub exposure: &'a Rgb,
+}
+
+impl Shown<'_> {
+    /// Mean of `channels` over the square of `side` pixels whose first is (x, y).
+    fn mean(&self, channels: &Range<usize>, side: usize, x: usize, y: usize) -> f64 {
+        let mut sum = 0.0;
+        for plane in &self.exposure.0[channels.clone()] {
+            for j in y..y + side {
+                sum += plane.data[j * plane.width + x..][..side].iter().map(|v| f64::from(*v)).sum::<f64>();
+            }
+        }
+        sum / (channels.len() * side * side) as f64
+    }
+
+    /// Whether `test` holds for all of `channels` in the rectangle of `w` x `h` pixels whose first is (x, y), and in how many pixels it does.
+    fn count(&self, channels: &Range<usize>, (x, y): (usize, usize), (w, h): (usize, usize), test: impl Fn(f32) -> bool) -> usize {
+        let planes = &self.frame.intensity.0[channels.clone()];
+        (y..y + h).map(|j| (x..x + w).filter(|i| planes.iter().all(|p| test(p.data[j * p.width + i]))).count()).sum()
+    }
+}
+
+/// Variance, as a density, of the blocks of `of` that `other`, at `motion` from it (centred pixels), shows as well and that no clipping touches; `channels`: those whose mean is looked at;
+/// `side`: pixels along the sides of the squares whose means are looked at, `block`: squares along the sides of a block.
+pub(super) fn blocks(
+    of: &Shown,
+    other: &Shown,
+    motion: &DMat3,
+    channels: &Range<usize>,
+    (side, block): (usize, usize),
+    quantum: &(impl Fn(f64) -> f64 + Sync),
+) -> Vec<Sample> {
+    let (w, h) = of.exposure.size();
+    let pixels = side * block;
+    let step = (pixels / 2) * (4 * w * h / (pixels * pixels)).div_ceil(ENOUGH).isqrt().max(1);
+    let centre = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
+    let one = |x: usize, y: usize| -> Option<Sample> {
+        let middle = DVec2::new(x as f64, y as f64) + 0.5 * (pixels as f64 - 1.0);
+        // Where the first square of those around the block lies in the other frame.
+        let there = (project(motion, middle - centre) + centre - 0.5 * (pixels as f64 - 1.0) - side as f64).round();
+        let around = pixels + 2 * side;
+        if there.x < 0.0 || there.y < 0.0 || there.x as usize + around > w || there.y as usize + around > h {
+            return None;
+        }
+        let (i, j) = (there.x as usize, there.y as usize);
+        let all = pixels * pixels;
+        let black = of.count(channels, (x, y), (pixels, pixels), |z| z <= 0.0);
+        if black as f64 > BLACK * all as f64
+            || of.count(channels, (x, y), (pixels, pixels), is_clear) < all
+            || other.count(channels, (i, j), (around, around), is_clear) < around * around
+        {
+            return None;
+        }
+        let wide = block + 2;
+        let shown: Vec<f64> = (0..wide * wide).map(|k| other.mean(channels, side, i + k % wide * side, j + k / wide * side)).collect();
+        let own: Vec<f64> = (0..block * block).map(|k| of.mean(channels, side, x + k % block * side, y + k / block * side)).collect();
+        let exposure = own.iter().sum::<f64>() / own.len() as f64;
+        let variance = residual(&own, &shown, block)?;
+        Some(Sample { exposure, variance: ((side * side) as f64 * variance - quantum(exposure)).max(0.0), blocks: 1.0 })
+    };
+    let rows = h.saturating_sub(pixels) / step + 1;
+    let columns = w.saturating_sub(pixels) / step + 1;
+    if w < pixels || h < pixels {
+        return Vec::new();
+    }
+    (0..rows).into_par_iter().flat_map_iter(|r| (0..columns).filter_map(move |c| one(c * step, r * step))).collect()
+}
+
+/// Mean square of what least squares leave of `own`, a block of `block` x `block` values, by the values around each of `shown`, which has one more on every side.
+fn residual(own: &[f64], shown: &[f64], block: usize) -> Option<f64> {
+    let wide = block + 2;
+    let mean = shown.iter().sum::<f64>() / shown.len() as f64;
+    let spread = (shown.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / shown.len() as f64).sqrt().max(f64::MIN_POSITIVE);
+    let row = |k: usize| -> SVector<f64, UNKNOWNS> {
+        let (x, y) = (k % block, k / block);
+        let place = |a: usize| (2 * a + 1) as f64 / block as f64 - 1.0;
+        SVector::from_fn(|u, _| match u {
+            0..9 => (shown[(y + u / 3) * wide + x + u % 3] - mean) / spread,
+            9 => 1.0,
+            10 => place(x),
+            _ => place(y),
+        })
+    };
+    let (mut a, mut b) = (SMatrix::<f64, UNKNOWNS, UNKNOWNS>::identity() * (RIDGE * own.len() as f64), SVector::<f64, UNKNOWNS>::zeros());
+    let scale = own.iter().map(|v| v * v).sum::<f64>().sqrt().max(f64::MIN_POSITIVE);
+    for (k, v) in own.iter().enumerate() {
+        let r = row(k);
+        a += r * r.transpose();
+        b += r * (v / scale);
+    }
+    let found = a.cholesky()?.solve(&b);
+    let left: f64 = own.iter().enumerate().map(|(k, v)| (v / scale - row(k).dot(&found)).powi(2)).sum();
+    Some(left * scale * scale / (own.len() - UNKNOWNS) as f64)
+}
