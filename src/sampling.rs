@@ -26,23 +26,41 @@ pub fn bilinear(p: &Plane, q: DVec2) -> f32 {
     (1.0 - v) * ((1.0 - u) * at(0, 0) + u * at(1, 0)) + v * ((1.0 - u) * at(0, 1) + u * at(1, 1))
 }
 
+/// c0 + c1 t + c2 t² + c3 t³ in each of four lanes.
+#[inline(always)]
+fn polynomials(c: &[[f32; 4]; 4], t: f32) -> [f32; 4] {
+    let mut v = c[3];
+    for c in [&c[2], &c[1], &c[0]] {
+        for (v, c) in v.iter_mut().zip(c) {
+            *v = *v * t + c;
+        }
+    }
+    v
+}
+
 /// Weights of the four pixels around fraction `t`.
 #[inline(always)]
 pub fn weights(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+    polynomials(&[[0.0, 1.0, 0.0, 0.0], [-0.5, 0.0, 0.5, 0.0], [1.0, -2.5, 2.0, -0.5], [-0.5, 1.5, -1.5, 0.5]], t)
 }
 
 /// Their derivatives.
 #[inline(always)]
 pub fn slopes(t: f32) -> [f32; 4] {
-    let t2 = t * t;
-    [0.5 * (-3.0 * t2 + 4.0 * t - 1.0), 0.5 * (9.0 * t2 - 10.0 * t), 0.5 * (-9.0 * t2 + 8.0 * t + 1.0), 0.5 * (3.0 * t2 - 2.0 * t)]
+    polynomials(&[[-0.5, 0.0, 0.5, 0.0], [2.0, -5.0, 4.0, -1.0], [-1.5, 4.5, -4.5, 1.5], [0.0; 4]], t)
 }
 
 #[inline(always)]
-fn along(w: &[f32; 4], row: &[f32; 4]) -> f32 {
-    w[0] * row[0] + w[1] * row[1] + w[2] * row[2] + w[3] * row[3]
+fn dot(a: &[f32; 4], b: &[f32; 4]) -> f32 {
+    (a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3])
+}
+
+/// `sum` += `w` times `row`, lane by lane.
+#[inline(always)]
+fn add(sum: &mut [f32; 4], w: f32, row: &[f32; 4]) {
+    for (s, r) in sum.iter_mut().zip(row) {
+        *s += w * r;
+    }
 }
 
 /// Calls `f` with each of the four rows of four pixels around pixel (`x`, `y`), the nearest edge pixel outside.
@@ -62,14 +80,18 @@ fn rows(plane: &Plane, x: isize, y: isize, mut f: impl FnMut(usize, &[f32; 4])) 
     }
 }
 
-/// `plane` at `p` (pixels).
+/// Each of `planes`, which are of one size, at `p` (pixels).
 #[inline(always)]
-pub fn cubic(plane: &Plane, p: DVec2) -> f32 {
+pub fn cubic<const N: usize>(planes: &[&Plane; N], p: DVec2) -> [f32; N] {
     let ((x, u), (y, v)) = (split(p.x), split(p.y));
     let (wx, wy) = (weights(u), weights(v));
-    let mut sum = 0.0;
-    rows(plane, x, y, |j, row| sum += wy[j] * along(&wx, row));
-    sum
+    let mut out = [0.0; N];
+    for (out, plane) in out.iter_mut().zip(planes) {
+        let mut columns = [0.0; 4];
+        rows(plane, x, y, |j, row| add(&mut columns, wy[j], row));
+        *out = dot(&wx, &columns);
+    }
+    out
 }
 
 /// `plane` at `p` (pixels) and its gradient.
@@ -77,12 +99,10 @@ pub fn cubic(plane: &Plane, p: DVec2) -> f32 {
 pub fn cubic_with_gradient(plane: &Plane, p: DVec2) -> (f32, [f32; 2]) {
     let ((x, u), (y, v)) = (split(p.x), split(p.y));
     let (wx, wy, sx, sy) = (weights(u), weights(v), slopes(u), slopes(v));
-    let (mut value, mut gx, mut gy) = (0.0, 0.0, 0.0);
+    let (mut columns, mut steps) = ([0.0; 4], [0.0; 4]);
     rows(plane, x, y, |j, row| {
-        let here = along(&wx, row);
-        value += wy[j] * here;
-        gx += wy[j] * along(&sx, row);
-        gy += sy[j] * here;
+        add(&mut columns, wy[j], row);
+        add(&mut steps, sy[j], row);
     });
-    (value, [gx, gy])
+    (dot(&wx, &columns), [dot(&sx, &columns), dot(&wx, &steps)])
 }

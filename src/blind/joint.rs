@@ -45,6 +45,28 @@ pub struct Joint {
     pub ways: Vec<Way>,
 }
 
+impl Joint {
+    /// Whether it explains pixels that no part of it has seen so much better than what is known without it, in the mean and of the frame `first` by itself, that it is believed.
+    pub fn is_believed(&self, first: Option<usize>) -> bool {
+        explains_better(&self.held_out, &self.held_out_merge, first, EXPLAINED)
+    }
+}
+
+/// Whether the squared residuals `of` are below `part` of those `than` in the geometric mean, and of the frame `first` by itself.
+fn explains_better(of: &[f64], than: &[f64], first: Option<usize>, part: f64) -> bool {
+    geometric_mean(of) < part * geometric_mean(than) && first.is_none_or(|k| of[k] < part * than[k])
+}
+
+/// What is known without a joint estimate.
+pub struct Known<'a> {
+    /// Irradiance: a merge, unblurred, or what frames that were taken for stationary show.
+    pub scene: &'a Plane,
+    /// Where each frame lies, and its blur if one is known.
+    pub tsfs: &'a [Tsf],
+    /// The first frame that was taken for stationary, which itself has to be explained better.
+    pub first: Option<usize>,
+}
+
 /// What TSFs are fitted to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -486,15 +508,24 @@ fn better<T>(best: Option<(f64, T)>, other: (f64, T)) -> (f64, T) {
 }
 
 /// Luminance and TSFs at the coarsest `level`, smoothness and trust in the operators falling: from each of `starts`, and the better one. Half
-/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `None` when `going` returns
+/// way does not tell: a start from a more blurred frame, which it explains by standing still, leads at first. `begun`: what is known already of one of them. `None` when `going` returns
 /// `false`, which it is asked after each round.
-fn at_coarsest(level: &Level, starts: &[Start], going: &mut dyn FnMut() -> bool) -> Option<State> {
+fn at_coarsest(level: &Level, starts: &[Start], begun: Option<&Begun>, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut best = None;
     for start in starts {
-        let state = from_start(level, start, None, going)?;
+        let state = match begun.filter(|b| b.state.reference == start.reference) {
+            Some(begun) => begun.state.clone(),
+            None => from_start(level, start, None, going)?,
+        };
         best = Some(better(best, (geometric_mean(&level.judge(&state)), state)));
     }
     best.map(|b| b.1)
+}
+
+/// What the coarsest level made of a start.
+#[derive(Clone)]
+pub struct Begun {
+    state: State,
 }
 
 /// [`at_coarsest`] from one start; the frame `still` does not move.
@@ -539,22 +570,23 @@ impl Doubt {
     }
 }
 
-/// Whether the frame of `start` may have moved, by a stroke longer than `stroke` in pixels, as well as all others, as the coarsest level tells, whatever the size of the frames. `None` when
-/// `going` returns `false`, which it is asked after each round.
-pub fn doubt(frames: &[Frame], start: &Start, stroke: f64, going: &mut dyn FnMut() -> bool) -> Option<Doubt> {
+/// Whether the frame of `start` may have moved, by a stroke longer than `stroke` in pixels, as well as all others, as the coarsest level tells, whatever the size of the frames; and what
+/// [`estimate`] can go on from. `None` when `going` returns `false`, which it is asked after each round.
+pub fn doubt(frames: &[Frame], start: &Start, stroke: f64, going: &mut dyn FnMut() -> bool) -> Option<(Doubt, Begun)> {
     let level = Level::new(frames, coarsest(frames), false);
     let moved = from_start(&level, start, None, going)?;
     let c = moved.tsfs[start.reference].covariance();
     let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
     let stroke_px = (12.0 * beyond).sqrt() * level.scale as f64;
     if stroke_px <= stroke {
-        return Some(Doubt { stroke_px, explained: (0.0, 0.0) });
+        return Some((Doubt { stroke_px, explained: (0.0, 0.0) }, Begun { state: moved }));
     }
     let still = from_start(&level, start, Some(start.reference), going)?;
-    let (still, moved) = (level.judge(&still), level.judge(&moved));
+    let begun = Begun { state: moved };
+    let (still, moved) = (level.judge(&still), level.judge(&begun.state));
     let ln = |still: f64, moved: f64| (still.max(1e-6) / moved.max(1e-6)).ln();
     let own = ln(still[start.reference], moved[start.reference]);
-    Some(Doubt { stroke_px, explained: (own, ln(geometric_mean(&still), geometric_mean(&moved))) })
+    Some((Doubt { stroke_px, explained: (own, ln(geometric_mean(&still), geometric_mean(&moved))) }, begun))
 }
 
 /// `state` of the level `from` on the next finer one, `level`, and `rounds` on from there. `None` as for [`at_coarsest`].
@@ -586,11 +618,11 @@ struct Look {
 
 impl Look {
     /// At `frames` from the better of `starts`. `None` as for [`estimate`].
-    fn at(frames: &[Frame], starts: &[Start], progress: &mut dyn FnMut(Stage) -> bool) -> Option<Self> {
+    fn at(frames: &[Frame], starts: &[Start], begun: Option<&Begun>, progress: &mut dyn FnMut(Stage) -> bool) -> Option<Self> {
         let scale = coarsest(frames);
         let (mut done, total) = (0, ROUNDS.0 * starts.len());
         let level = Level::new(frames, scale, false);
-        let state = at_coarsest(&level, starts, &mut || {
+        let state = at_coarsest(&level, starts, begun, &mut || {
             done += 1;
             progress(Stage { scale, fraction: done as f32 / total as f32 })
         })?;
@@ -628,9 +660,15 @@ fn at_last(
     Some((level, state))
 }
 
-/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`. `merged` is what the judgement compares with: a merge, unblurred, and where each frame lies. `progress` returning `false`
-/// ends the work: `None`, as for no start.
-pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), progress: &mut dyn FnMut(Stage) -> bool) -> Option<Joint> {
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`, of one of which [`doubt`] may have `begun`. Where the second level explains `known.first` or all frames no
+/// better than what is known, that level's first answer is the last one: it will not be believed. `progress` returning `false` ends the work: `None`, as for no start.
+pub fn estimate(
+    frames: &[Frame],
+    starts: &[Start],
+    begun: Option<&Begun>,
+    known: &Known,
+    progress: &mut dyn FnMut(Stage) -> bool,
+) -> Option<Joint> {
     let (first, last) = (coarsest(frames), finest(frames));
     let cost = |scale: usize, rounds: usize| rounds as f32 / (scale * scale) as f32;
     // Small frames have one level, on which the second's work is done as well.
@@ -649,8 +687,14 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         progress(Stage { scale, fraction: done / total.get() })
     };
 
-    let look = Look::at(frames, starts, &mut |s| advance(s.scale))?;
-    let (level, state, ways) = {
+    let look = Look::at(frames, starts, begun, &mut |s| advance(s.scale))?;
+    // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
+    let otherwise = |level: &Level, reference: usize| {
+        let mut still = level.placed(known.scene, known.tsfs, reference);
+        level.settle(&mut still);
+        level.judge(&still)
+    };
+    let (level, state, ways) = 'found: {
         let mut level = Level::new(frames, scale, true);
         let fitted_to_best = |level: &Level, advance: &mut dyn FnMut(usize) -> bool| {
             at_finer(level, look.state.clone(), &look.level, ROUNDS.1, None, &mut || advance(scale))
@@ -660,8 +704,12 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         let mut random = Random::new(SEED, 1);
         let drawn = drawn_at_coarsest(&look, &mut random, &mut || advance(first))?;
         let best = fitted_to_best(&level, &mut advance)?;
+        let held_out = level.judge(&best);
+        if known.first.is_some() && !explains_better(&held_out, &otherwise(&level, best.reference), known.first, 1.0) {
+            break 'found (level, best, vec![Way { fitted_to: FittedTo::Best, held_out: geometric_mean(&held_out) }]);
+        }
         // A soft scene makes for TSFs that are too thick, all by the same: these explain the frames less well than a lens does.
-        let mut best = (geometric_mean(&level.judge(&best)), best);
+        let mut best = (geometric_mean(&held_out), best);
         for (tried, lens_px) in LENSES.into_iter().enumerate() {
             let behind = Level { lens_px, ..level.clone() };
             let fitted = fitted_to_best(&behind, &mut advance)?;
@@ -688,15 +736,10 @@ pub fn estimate(frames: &[Frame], starts: &[Start], merged: (&Plane, &[Tsf]), pr
         let (level, state) = at_last(frames, level, state, last, draws, &mut advance)?;
         (level, state, ways)
     };
-    let held_out = level.judge(&state);
-    // Solved alike, held-out pixels left out: a merge that has seen them would fit their noise.
-    let mut still = level.placed(merged.0, merged.1, state.reference);
-    level.settle(&mut still);
-    let held_out_merge = level.judge(&still);
+    let (held_out, held_out_merge) = (level.judge(&state), otherwise(&level, state.reference));
     let (tsfs, luminance) = level.on_frame(&state, frames[0].blurred.size());
     let lens_px = level.lens_px * level.scale as f32;
-    let reference = state.reference;
-    Some(Joint { luminance, tsfs, lens_px, scale: last, reference, held_out, held_out_merge, ways })
+    Some(Joint { luminance, tsfs, lens_px, scale: level.scale, reference: state.reference, held_out, held_out_merge, ways })
 }
 
 /// Whether frames of this size are worked on as they are, not at a smaller one.

@@ -15,7 +15,7 @@ mod operator;
 mod patches;
 
 pub use joint::{
-    Doubt, EXPLAINED, FittedTo, Joint, STROKE, STROKE_OF_SEVERAL, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp,
+    Begun, Doubt, FittedTo, Joint, Known, STROKE, STROKE_OF_SEVERAL, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp,
     geometric_mean,
 };
 pub use luminance::{Frame, luminance_of};

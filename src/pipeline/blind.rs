@@ -1,7 +1,7 @@
 //! The stage for brackets without a sharp frame: what [`crate::blind`] needs of the run, and whether its answer is believed.
 
 use super::{Event, Run, Settings};
-use crate::blind::{self, Doubt, Frame, Lack, PatchSetup, Start};
+use crate::blind::{self, Begun, Doubt, Frame, Known, Lack, PatchSetup, Start};
 use crate::error::{Error, Result};
 use crate::image::{Channels, Plane, Rgb};
 use crate::mask;
@@ -160,11 +160,13 @@ impl Run<'_> {
     }
 
     /// The joint estimate of irradiance and the TSFs of all of the frames `used`; `None` where it explains pixels that it was not fitted to no better than what is known
-    /// without it: a merge, or what is `known` of a scene, the TSFs under it and the first frame that was taken for stationary, which itself has to be explained better.
+    /// without it: a merge, or what is `known` of a scene, the TSFs under it and the first frame that was taken for stationary, which itself has to be explained better. `begun`: what [`Run::doubt`]
+    /// left to go on from.
     pub(super) fn joint(
         &mut self,
         used: &[usize],
         known: Option<(&Rgb, &[Option<Tsf>], usize)>,
+        begun: Option<&Begun>,
         from: f32,
         to: f32,
     ) -> Result<Option<Found>> {
@@ -175,8 +177,10 @@ impl Run<'_> {
         let tsf = |i: usize| known.and_then(|k| k.1[i].clone()).unwrap_or_else(|| Tsf::still(self.motions[i]));
         let otherwise: Vec<Tsf> = used.iter().map(|&i| tsf(i)).collect();
         let scene = known.map_or(&merged, |k| k.0).mean_of(channels);
+        let first = known.and_then(|k| used.iter().position(|&i| i == k.2));
         let events = &mut self.events;
-        let found = blind::estimate(&frames, &starts, (&scene, &otherwise), &mut |s| {
+        let known = Known { scene: &scene, tsfs: &otherwise, first };
+        let found = blind::estimate(&frames, &starts, begun, &known, &mut |s| {
             let size = if s.scale > 1 { format!(" at 1/{} of the size", s.scale) } else { String::new() };
             events(Event::Progress {
                 stage: format!("no frame is sharp: estimating all blurs{size}"),
@@ -184,12 +188,9 @@ impl Run<'_> {
             })
         })
         .ok_or(Error::Cancelled)?;
-        let (joint, alone) = (blind::geometric_mean(&found.held_out), blind::geometric_mean(&found.held_out_merge));
         let (w, h) = self.bracket.size();
         let extents: Vec<f64> = found.tsfs.iter().map(|t| tsf::extent(t, w, h)).collect();
-        let first = known.and_then(|k| used.iter().position(|&i| i == k.2));
-        let believed =
-            joint < blind::EXPLAINED * alone && first.is_none_or(|k| found.held_out[k] < blind::EXPLAINED * found.held_out_merge[k]);
+        let believed = found.is_believed(first);
         self.blind = json!({
             "method": "joint",
             "reference": names[found.reference],
@@ -219,7 +220,7 @@ impl Run<'_> {
 
     /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved by more than `stroke` pixels as well as all others; `None` where
     /// the edges of one of these are as hard as a sharp frame's.
-    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize], stroke: f64) -> Result<Option<Doubt>> {
+    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize], stroke: f64) -> Result<Option<(Doubt, Begun)>> {
         if !still.iter().all(|&i| self.is_soft(i)) {
             return Ok(None);
         }

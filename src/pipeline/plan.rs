@@ -5,7 +5,7 @@ use super::judge::{self, BlurEvidence, Judgement, Kind};
 use super::place::Placed;
 use super::shaken::{for_estimates, for_first_round};
 use super::{Outcome, Run};
-use crate::blind;
+use crate::blind::{self, Begun};
 use crate::deblur::{self, Solution};
 use crate::error::Result;
 use crate::image::Rgb;
@@ -150,15 +150,15 @@ impl Run<'_> {
         if given || !(none_sharp || matches!(self.settings.blind, Blind::Joint | Blind::Patches)) {
             return Ok(());
         }
-        self.take_all_blurs(state)?;
+        self.take_all_blurs(state, None)?;
         if state.latent.is_none() {
             self.degrade("camera shake does not explain the frames if all of them moved: they are judged beside the shortest".into())?;
         }
         Ok(())
     }
 
-    /// The joint estimate of all frames' TSFs, or the paper's, if it explains them.
-    fn take_all_blurs(&mut self, state: &mut State) -> Result<()> {
+    /// The joint estimate of all frames' TSFs, or the paper's, if it explains them. `begun`: what a doubt left to go on from.
+    fn take_all_blurs(&mut self, state: &mut State, begun: Option<&Begun>) -> Result<()> {
         let used = state.all();
         let (scene, tsfs) = (state.latent.take(), state.tsfs.clone());
         let known = scene.as_ref().zip(self.first_reference(&state.still)).map(|(scene, first)| (scene, tsfs.as_slice(), first));
@@ -173,7 +173,7 @@ impl Run<'_> {
                 let found = if run.settings.blind == Blind::Patches {
                     run.patches(&used, 0.03, 0.60)?
                 } else {
-                    run.joint(&used, known, 0.03, 0.60)?
+                    run.joint(&used, known, begun, 0.03, 0.60)?
                 };
                 Ok((found, run.motions.clone(), run.blind.clone(), run.degraded.clone()))
             },
@@ -203,11 +203,11 @@ impl Run<'_> {
         let explained = state.shaken.iter().all(|&i| state.tsfs[i].is_some());
         let stroke = if state.still.len() == 1 { blind::STROKE } else { blind::STROKE_OF_SEVERAL };
         let doubt = if asked && explained { self.doubt(first, &state.still, &state.all(), stroke)? } else { None };
-        let Some(doubt) = doubt else { return Ok(()) };
+        let Some((doubt, begun)) = doubt else { return Ok(()) };
         let founded = doubt.is_founded(stroke);
         state.judgements[first] = Some(judge::doubted(doubt.stroke_px, stroke, founded));
         if founded {
-            self.take_all_blurs(state)?;
+            self.take_all_blurs(state, Some(&begun))?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
             }

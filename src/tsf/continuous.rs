@@ -77,18 +77,37 @@ impl<'a> Evidence<'a> {
 
     /// Weighted differences that `pose` makes of the latent irradiance: its column of A.
     fn column(&self, pose: &Pose, focal: f64) -> Vec<f32> {
+        let [column] = self.columns(&[self.latent], pose, focal);
+        column
+    }
+
+    /// [`Evidence::column`] of each of `planes`, which are as large as the latent irradiance.
+    fn columns<const N: usize>(&self, planes: &[&Plane; N], pose: &Pose, focal: f64) -> [Vec<f32>; N] {
         let turn = Projection::new(self.back * pose.rotation(focal).inverse());
         let t = DVec2::new(pose.t_x, pose.t_y);
-        let mut v = vec![0.0; self.pixels.len()];
+        let mut values = vec![[0.0; N]; self.pixels.len()];
         wide(
             #[inline(always)]
             || {
-                for (v, q) in v.iter_mut().zip(&self.pixels) {
-                    *v = cubic(self.latent, turn.of(*q - t) + self.origin);
+                for (v, q) in values.iter_mut().zip(&self.pixels) {
+                    *v = cubic(planes, turn.of(*q - t) + self.origin);
                 }
             },
         );
-        self.rows.iter().map(|&(a, b, k)| k * (v[b as usize] - v[a as usize])).collect()
+        std::array::from_fn(|n| self.rows.iter().map(|&(a, b, k)| k * (values[b as usize][n] - values[a as usize][n])).collect())
+    }
+
+    /// Weighted differences that `tsf` makes of each of `planes`, which are as large as the latent irradiance.
+    pub fn predicted<const N: usize>(&self, planes: &[&Plane; N], tsf: &Tsf) -> [Vec<f32>; N] {
+        let columns: Vec<[Vec<f32>; N]> = tsf.poses.par_iter().map(|p| self.columns(planes, p, tsf.focal_px)).collect();
+        let mut sums: [Vec<f32>; N] = std::array::from_fn(|_| vec![0.0; self.rows.len()]);
+        for (columns, p) in columns.iter().zip(&tsf.poses) {
+            let w = p.weight as f32;
+            for (sum, column) in sums.iter_mut().zip(columns) {
+                sum.iter_mut().zip(column).for_each(|(s, v)| *s += w * v);
+            }
+        }
+        sums
     }
 
     /// Weighted differences of the frame.
@@ -98,15 +117,8 @@ impl<'a> Evidence<'a> {
 
     /// Weighted residual of `tsf` at each difference.
     pub fn residual(&self, tsf: &Tsf) -> Vec<f32> {
-        let columns: Vec<Vec<f32>> = tsf.poses.par_iter().map(|p| self.column(p, tsf.focal_px)).collect();
-        let mut r = self.targets.clone();
-        for (c, p) in columns.iter().zip(&tsf.poses) {
-            let w = p.weight as f32;
-            for (r, v) in r.iter_mut().zip(c) {
-                *r -= w * v;
-            }
-        }
-        r
+        let [predicted] = self.predicted(&[self.latent], tsf);
+        self.targets.iter().zip(predicted).map(|(t, p)| t - p).collect()
     }
 
     /// Mean square of [`Evidence::residual`].

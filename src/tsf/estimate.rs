@@ -83,6 +83,12 @@ impl Estimate {
     pub fn is_sound(&self) -> bool {
         self.evidence > EVIDENCE
     }
+
+    /// That of a level on the pixels of the frame 2^`size` times as large that is asked about, of which the level is 2^-`below` in size: what lies between its poses there is filled.
+    fn on_frame(self, size: usize, below: usize, base: &DMat3) -> Self {
+        let tsf = filled(&self.tsf, f64::from(1u32 << below)).scaled(f64::from(1u32 << size)).about(*base);
+        Self { tsf, scale: 1 << (size + below), ..self }
+    }
 }
 
 /// Least [`Estimate::evidence`] of a TSF that says something: noise alone reaches 1 to 2.
@@ -343,21 +349,41 @@ fn main_path(tsf: &Tsf, chart: &Chart) -> Option<Tsf> {
 }
 
 impl WholeFrame<'_> {
-    /// [`WholeFrame::estimate`] of this frame and of it at 1/2, 1/4, ... of its size, `levels` sizes in all as far as they show anything: where the latent irradiance is
-    /// noisy, coarse structure tells more of a blur than fine. The TSFs are on this frame's pixels.
-    pub fn estimates(&self, search: &Search, levels: usize) -> Vec<Option<Estimate>> {
+    /// What this frame, and it at 1/2, 1/4, ... of its size, `sizes` in all as far as they show anything, say of its blur: where the latent irradiance is noisy, coarse
+    /// structure tells more of one than fine. The TSFs are on this frame's pixels.
+    pub fn estimates(&self, search: &Search, sizes: usize) -> Vec<Option<Estimate>> {
         let (w, h) = self.size();
         let fits = |l: &usize| *l == 0 || w.min(h) >> l >= SMALLEST;
-        let smaller = self.levels((0..levels).filter(fits).count().max(1) - 1);
-        let one = |l: usize| {
-            let found = if l == 0 { self.estimate(search) } else { smaller[l - 1].frame().estimate(search) }?;
-            Some(Estimate { tsf: found.tsf.scaled(f64::from(1u32 << l)), scale: found.scale << l, ..found })
-        };
-        (0..=smaller.len()).map(one).collect()
+        let mut found: Vec<Option<Estimate>> = vec![None; (0..sizes).filter(fits).count().max(1)];
+        self.descend(search, &mut |frame, l, tsf, last| {
+            let here = || choose(frame, l, tsf, search);
+            if last {
+                // No finer size tells more.
+                let here = here();
+                for (k, finer) in found.iter_mut().enumerate().take(l + 1) {
+                    *finer = Some(here.clone().on_frame(k, l - k, &self.base));
+                }
+            } else if l < found.len() {
+                found[l] = Some(here().on_frame(l, 0, &self.base));
+            }
+        });
+        found
     }
 
     /// TSF of this frame from nothing; `None` when no pose explains it better than none.
     pub fn estimate(&self, search: &Search) -> Option<Estimate> {
+        let mut found = None;
+        self.descend(search, &mut |frame, l, tsf, last| {
+            if last {
+                found = Some(choose(frame, l, tsf, search).on_frame(0, l, &self.base));
+            }
+        });
+        found
+    }
+
+    /// The TSF from the coarsest level to the finest, or to that at which the blur is so long that finer ones tell nothing more. `visit` is told each level's frame, its
+    /// number, the TSF on this frame's pixels, and whether it is the last; where no pose explains one better than none it is not told of that and of finer ones.
+    fn descend(&self, search: &Search, visit: &mut dyn FnMut(&WholeFrame, usize, &Tsf, bool)) -> Option<()> {
         let (w, h) = self.size();
         let mut count = 0;
         while w.min(h) >> (count + 1) >= SMALLEST {
@@ -372,8 +398,7 @@ impl WholeFrame<'_> {
         let grid = PoseGrid::new(cw, ch, RADIUS.min(cw.min(ch) / 5), DEGREES, 1.0);
         let mut tsf = coarse.fit_grid(&grid, None)?.scaled((1 << count) as f64);
         tsf.focal_px = focal;
-        let mut l = count;
-        loop {
+        for l in (0..=count).rev() {
             if search.is_stopped() {
                 return None;
             }
@@ -392,17 +417,18 @@ impl WholeFrame<'_> {
             let rows = frame.rows(ROWS, margin);
             here = Evidence::new(&frame, &rows).refine(&here, &chart, if l == 0 { 10 } else { 5 });
             tsf = here.scaled(scale);
-            if l == 0 {
+            let long = l > 0 && extent(&here, fw, fh) * 2.0 > FINEST_EXTENT;
+            let short = if long { short(&level(l - 1), &here.scaled(2.0), planar) } else { None };
+            let last = l == 0 || long && short.is_none();
+            visit(&frame, l, &tsf, last);
+            if last {
                 break;
             }
-            if extent(&here, fw, fh) * 2.0 > FINEST_EXTENT {
-                let Some(short) = short(&level(l - 1), &here.scaled(2.0), planar) else { break };
+            if let Some(short) = short {
                 tsf = short.scaled(0.5 * scale);
             }
-            l -= 1;
         }
-        let found = choose(&level(l), l, &tsf, focal, search);
-        Some(Estimate { tsf: found.tsf.about(self.base), ..found })
+        Some(())
     }
 
     /// TSF of this frame, if that is a slight blur, of a few pixels about where the frame lies; `None` when no such pose explains it better than none.
@@ -414,8 +440,7 @@ impl WholeFrame<'_> {
         // What is left without any blur is more than noise: the second time counts what the first leaves.
         let first = near(&evidence, &chart, evidence.misfit(&Tsf::identity()).sqrt())?;
         let found = near(&evidence, &chart, evidence.misfit(&first).sqrt())?;
-        let found = choose(self, 0, &found, focal, search);
-        Some(Estimate { tsf: found.tsf.about(self.base), ..found })
+        Some(choose(self, 0, &found, search).on_frame(0, 0, &self.base))
     }
 
     /// `tsf` against a better latent irradiance: its poses and weights, moved within their own model, for at most so many `iterations`.
@@ -457,9 +482,9 @@ impl WholeFrame<'_> {
     }
 }
 
-/// The model of the TSF, and the TSF within it, from the planar `tsf` at level `l`.
-fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) -> Estimate {
-    let scale = (1 << l) as f64;
+/// The model of the TSF, and the TSF within it on the pixels of `frame`, from the planar `tsf` on those of a frame 2^`l` times as large.
+fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, search: &Search) -> Estimate {
+    let (scale, focal) = ((1 << l) as f64, tsf.focal_px);
     let (w, h) = frame.size();
     let start = tsf.scaled(1.0 / scale);
     let all = frame.rows(ROWS, margin(&start, (w, h)));
@@ -530,18 +555,7 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, focal: f64, search: &Search) 
     let residual = evidence.misfit(&here);
     let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
     let evidence = (mean_square(evidence.targets()) - residual) * all.len() as f64 / numbers as f64;
-    Estimate {
-        tsf: filled(&here, scale),
-        model,
-        focal: source,
-        trials,
-        still_worse_by,
-        still_error,
-        blank_worse_by,
-        scale: 1 << l,
-        residual,
-        evidence,
-    }
+    Estimate { tsf: here, model, focal: source, trials, still_worse_by, still_error, blank_worse_by, scale: 1, residual, evidence }
 }
 
 /// `tsf` of a level on frame pixels, `factor` to one of the level's: gaps between poses, which grow with the pixels, are filled by a tent.

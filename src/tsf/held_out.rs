@@ -92,16 +92,14 @@ impl Filters {
 
     /// Residuals of the differences held out where `tsf` blurs the latent irradiance and the gain and the filters' shares suit the others best.
     pub fn residual(&self, frame: &WholeFrame, held: &HeldOut, tsf: &Tsf) -> Vec<f32> {
-        let predicted = |latent: &Plane, rows: &[Row]| -> Vec<f32> {
-            let evidence = Evidence::new(&WholeFrame { latent, ..*frame }, rows);
-            evidence.targets().iter().zip(evidence.residual(tsf)).map(|(t, r)| t - r).collect()
-        };
-        let columns = |rows: &[Row]| -> Vec<Vec<f32>> {
-            let sharp = predicted(frame.latent, rows);
-            let mut all: Vec<Vec<f32>> =
-                self.0.iter().map(|f| predicted(f, rows).iter().zip(&sharp).map(|(f, s)| f - s).collect()).collect();
-            all.insert(0, sharp);
-            all
+        let [first, second, glare] = &self.0;
+        let columns = |rows: &[Row]| -> [Vec<f32>; 1 + RADII.len()] {
+            let mut columns = Evidence::new(frame, rows).predicted(&[frame.latent, first, second, glare], tsf);
+            let [sharp, filtered @ ..] = &mut columns;
+            for column in filtered {
+                column.iter_mut().zip(&*sharp).for_each(|(f, s)| *f -= s);
+            }
+            columns
         };
         let shares = shares(&columns(&held.inside), &frame.targets(&held.inside));
         let mut residual = frame.targets(&held.outside);

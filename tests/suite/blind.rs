@@ -2,7 +2,7 @@
 
 use crate::oracle::blur as oracle;
 use crate::support::{assert_close, f64s, noise, uniform};
-use unshaken::blind::{self, FittedTo, Frame, Lack, Operator, PatchSetup, Stage, Start, fix_warp};
+use unshaken::blind::{self, FittedTo, Frame, Known, Lack, Operator, PatchSetup, Stage, Start, fix_warp};
 use unshaken::image::Plane;
 use unshaken::pose::{Pose, PoseGrid};
 use unshaken::psf::{self, Patch, Psf};
@@ -118,6 +118,10 @@ fn mean(frames: &[Frame]) -> Plane {
     }
 }
 
+fn as_placed<'a>(scene: &'a Plane, tsfs: &'a [Tsf]) -> Known<'a> {
+    Known { scene, tsfs, first: None }
+}
+
 fn still() -> Vec<Tsf> {
     vec![Tsf::identity(); 3]
 }
@@ -152,7 +156,7 @@ fn scene_and_shakes_are_found_together() {
     let merged = mean(&frames);
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut last = 0.0;
-    let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, None, &as_placed(&merged, &still()), &mut |s| {
         assert!(s.fraction >= last && s.fraction <= 1.001, "progress goes on: {last} to {}", s.fraction);
         last = s.fraction;
         true
@@ -199,7 +203,7 @@ fn what_a_lens_does_is_no_motion() {
     let found = |latent: &Plane| {
         let frames = frames(latent, &tsfs);
         let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
-        let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| true).unwrap();
+        let found = blind::estimate(&frames, &starts, None, &as_placed(&mean(&frames), &still()), &mut |_| true).unwrap();
         let truth = latent.crop(PAD, PAD, SIZE.0, SIZE.1);
         let off = difference(&found.luminance, &truth) / difference(&frames[0].blurred, &truth);
         let thicker: Vec<f64> = found.tsfs.iter().zip(&tsfs).map(|(f, t)| spread(f) - spread(t)).collect();
@@ -222,7 +226,7 @@ fn of_two_starts_the_one_that_explains_more_goes_on() {
     let residual = |references: &[usize]| {
         let starts: Vec<Start> =
             references.iter().map(|&reference| Start { reference, luminance: frames[reference].blurred.clone() }).collect();
-        let found = blind::estimate(&frames, &starts, (&merged, &still()), &mut |_| true).unwrap();
+        let found = blind::estimate(&frames, &starts, None, &as_placed(&merged, &still()), &mut |_| true).unwrap();
         (found.reference, blind::geometric_mean(&found.held_out))
     };
     let alone = [residual(&[0]), residual(&[2])];
@@ -238,7 +242,9 @@ fn a_still_bracket_is_explained_as_well_by_a_merge() {
     let latent = tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD);
     let frames = frames(&latent, &[Tsf::identity(), Tsf::identity(), Tsf::identity()]);
     let merged = mean(&frames);
-    let found = blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], (&merged, &still()), &mut |_| true).unwrap();
+    let found =
+        blind::estimate(&frames, &[Start { reference: 0, luminance: merged.clone() }], None, &as_placed(&merged, &still()), &mut |_| true)
+            .unwrap();
     for (joint, alone) in found.held_out.iter().zip(&found.held_out_merge) {
         assert!(*joint > 0.8 * alone, "nothing is left to win: {joint} against {alone}");
     }
@@ -252,7 +258,7 @@ fn cross_validated_tsfs_explain_pixels_that_were_not_seen_better() {
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let merged = &frames[1].blurred;
     let mut last = Stage { scale: 2, fraction: 0.0 };
-    let found = blind::estimate(&frames, &starts, (merged, &still()), &mut |s| {
+    let found = blind::estimate(&frames, &starts, None, &as_placed(merged, &still()), &mut |s| {
         assert!(s.fraction > last.fraction && s.scale <= last.scale, "progress goes on: {last:?} to {s:?}");
         last = s;
         true
@@ -279,7 +285,7 @@ fn the_joint_estimate_can_be_cancelled() {
     let frames = frames(&tiles(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD), &shakes());
     let starts = [Start { reference: 0, luminance: frames[0].blurred.clone() }];
     let mut calls = 0;
-    let found = blind::estimate(&frames, &starts, (&mean(&frames), &still()), &mut |_| {
+    let found = blind::estimate(&frames, &starts, None, &as_placed(&mean(&frames), &still()), &mut |_| {
         calls += 1;
         calls < 2
     });
