@@ -4,6 +4,8 @@
 //! its neighbours, and a camera's engine smooths it further; the density stays what the sensor made it, while the variance of differences between
 //! neighbours falls to a tenth (green of a converter's file), to a three hundredth (JPEG). So the density is measured on means of squares of [`MIDDLE`] and
 //! [`COARSE`] pixels as well as on pixels.
+//!
+//! Texture passes for noise where no part of a picture is flat. Once the frames are placed it is told by the others, which show it as well ([`estimate_registered`]).
 
 use crate::exposure::Frame;
 use crate::image::{Channels, Plane, Rgb};
@@ -269,7 +271,7 @@ fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> Fra
     let mean = exposure.mean();
     // Rounding is independent in the channels.
     let rounding = |x: f64| quantum.iter().map(|q| q(x)).sum::<f64>() / 9.0;
-    let beside = |channels: Range<usize>, side: usize, quantum: &(dyn Fn(f64) -> f64 + Sync)| -> Vec<Vec<Sample>> {
+    let beside_others = |channels: Range<usize>, side: usize, quantum: &(dyn Fn(f64) -> f64 + Sync)| -> Vec<Vec<Sample>> {
         let &(_, block, of_noise) = beside::BLOCKS.iter().find(|b| b.0 == side).expect("a side that is looked at");
         let one = |(other, motion): &(Shown, DMat3)| {
             bins(beside::blocks(&shown, other, motion, &channels, (side, block), &quantum), FLATTEST_BESIDE, of_noise)
@@ -277,9 +279,10 @@ fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> Fra
         others.iter().map(one).collect()
     };
     let of_channel = |c: usize, side: usize, block: usize| {
-        lowest(samples(&exposure.0[c], &own[c], side, block, &quantum[c]), &beside(c..c + 1, side, &quantum[c]))
+        lowest(samples(&exposure.0[c], &own[c], side, block, &quantum[c]), &beside_others(c..c + 1, side, &quantum[c]))
     };
-    let of_mean = |side: usize, block: usize| lowest(samples(&mean, &of_all, side, block, &rounding), &beside(0..3, side, &rounding));
+    let of_mean =
+        |side: usize, block: usize| lowest(samples(&mean, &of_all, side, block, &rounding), &beside_others(0..3, side, &rounding));
     let model = |s: &[Sample]| fit(s, BELOW).map(|m| floored(m, s));
     let assumed = NoiseModel::from_electrons(ASSUMED.0, ASSUMED.1);
     let [fine, middle, coarse] = [of_mean(1, BLOCK), of_mean(MIDDLE, MIDDLE_BLOCK), of_mean(COARSE, COARSE_BLOCK)];

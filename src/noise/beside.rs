@@ -4,7 +4,7 @@
 //! gain, black, a displacement by part of a square, sharpening and blur are all such functions. What least squares leave is the frame's noise, some of the other's, and texture that the
 //! other does not show: never less than the frame's noise.
 
-use super::{BLACK, ENOUGH, Sample, is_clear};
+use super::{BLACK, Sample, is_clear};
 use crate::exposure::Frame;
 use crate::image::Rgb;
 use crate::pose::project;
@@ -15,6 +15,8 @@ use std::ops::Range;
 
 /// Unknowns of a block: 3 x 3 squares of the other frame, a constant and slopes along x and y.
 const UNKNOWNS: usize = 12;
+/// Blocks of one channel that are enough, about: a tenth of those whose flattest twentieth tells, as each takes as long as ten of them.
+const ENOUGH: usize = 6_000;
 /// Added to the diagonal of the normal equations of unit regressors: what the other frame shows nothing of stays 0.
 const RIDGE: f64 = 1e-9;
 /// Side of the blocks of means of squares of 1, 2 and 4 pixels, and the quantile [`super::FLATTEST_BESIDE`] of the mean square of their residuals over its expectation: that of χ² over its degrees of
@@ -40,7 +42,7 @@ impl Shown<'_> {
         sum / (channels.len() * side * side) as f64
     }
 
-    /// Whether `test` holds for all of `channels` in the rectangle of `w` x `h` pixels whose first is (x, y), and in how many pixels it does.
+    /// Pixels of the rectangle of `w` x `h` pixels whose first is (x, y) in which `test` holds for all of `channels`.
     fn count(&self, channels: &Range<usize>, (x, y): (usize, usize), (w, h): (usize, usize), test: impl Fn(f32) -> bool) -> usize {
         let planes = &self.frame.intensity.0[channels.clone()];
         (y..y + h).map(|j| (x..x + w).filter(|i| planes.iter().all(|p| test(p.data[j * p.width + i]))).count()).sum()
@@ -59,6 +61,9 @@ pub(super) fn blocks(
 ) -> Vec<Sample> {
     let (w, h) = of.exposure.size();
     let pixels = side * block;
+    if w < pixels || h < pixels {
+        return Vec::new();
+    }
     let step = (pixels / 2) * (4 * w * h / (pixels * pixels)).div_ceil(ENOUGH).isqrt().max(1);
     let centre = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
     let one = |x: usize, y: usize| -> Option<Sample> {
@@ -85,11 +90,7 @@ pub(super) fn blocks(
         let variance = residual(&own, &shown, block)?;
         Some(Sample { exposure, variance: ((side * side) as f64 * variance - quantum(exposure)).max(0.0), blocks: 1.0 })
     };
-    let rows = h.saturating_sub(pixels) / step + 1;
-    let columns = w.saturating_sub(pixels) / step + 1;
-    if w < pixels || h < pixels {
-        return Vec::new();
-    }
+    let (rows, columns) = ((h - pixels) / step + 1, (w - pixels) / step + 1);
     (0..rows).into_par_iter().flat_map_iter(|r| (0..columns).filter_map(move |c| one(c * step, r * step))).collect()
 }
 
