@@ -205,8 +205,6 @@ const WHITE: f64 = 4.0;
 const ENOUGH: usize = 60_000;
 /// Quantile of blocks that is taken for noise alone, as texture only ever adds.
 const FLATTEST: f64 = 0.05;
-/// The same of blocks beside another frame, which leaves less texture.
-const FLATTEST_BESIDE: f64 = 0.2;
 /// That quantile of the mean square of so many squared samples of filtered white noise over its expectation (10⁶ simulated blocks).
 const OF_NOISE: [(usize, f64); 3] = [(BLOCK, 0.555), (MIDDLE_BLOCK, 0.311), (COARSE_BLOCK, 0.214)];
 /// Most that correlation is believed to be: beyond, the finest structure is what compression left of it. With it, the density of green at [`MIDDLE`] is right in the median on files of
@@ -235,8 +233,9 @@ pub fn estimate(frames: &[Frame], exposures: &[Rgb], response: &Response) -> Vec
     (0..frames.len()).into_par_iter().map(|i| of_frame(Shown { frame: &frames[i], exposure: &exposures[i] }, &[], response)).collect()
 }
 
-/// [`estimate`] of the frames `ids`, which lie at `motions` from the reference (centred pixels), by what the others of them leave of each as well: texture is in all of them. Of the other frames
-/// `known` stays.
+/// [`estimate`] of the frames `ids`, which lie at `motions` from the reference (centred pixels), by what the others of
+/// them leave of each as well: texture is in all of them. `known`: what [`estimate`] found, which stays of a frame that
+/// no other one lies beside.
 pub fn estimate_registered(
     frames: &[Frame],
     exposures: &[Rgb],
@@ -244,8 +243,11 @@ pub fn estimate_registered(
     (ids, motions): (&[usize], &[DMat3]),
     known: &[FrameNoise],
 ) -> Vec<FrameNoise> {
-    let shown = |i: usize| Shown { frame: &frames[i], exposure: &exposures[i] };
     let mut found = known.to_vec();
+    if ids.len() < 2 {
+        return found;
+    }
+    let shown = |i: usize| Shown { frame: &frames[i], exposure: &exposures[i] };
     let own = |&i: &usize| {
         let back = motions[i].inverse();
         let others: Vec<_> = ids.iter().filter(|&&k| k != i).map(|&k| (shown(k), motions[k] * back)).collect();
@@ -274,7 +276,7 @@ fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> Fra
     let beside_others = |channels: Range<usize>, side: usize, quantum: &(dyn Fn(f64) -> f64 + Sync)| -> Vec<Vec<Sample>> {
         let &(_, block, of_noise) = beside::BLOCKS.iter().find(|b| b.0 == side).expect("a side that is looked at");
         let one = |(other, motion): &(Shown, DMat3)| {
-            bins(beside::blocks(&shown, other, motion, &channels, (side, block), &quantum), FLATTEST_BESIDE, of_noise)
+            bins(beside::blocks(&shown, other, motion, &channels, (side, block), &quantum), beside::FLATTEST, of_noise)
         };
         others.iter().map(one).collect()
     };

@@ -660,8 +660,10 @@ fn at_last(
     Some((level, state))
 }
 
-/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`, of one of which [`doubt`] may have `begun`. Where the second level explains `known.first` or all frames no
-/// better than what is known, that level's first answer is the last one: it will not be believed. `progress` returning `false` ends the work: `None`, as for no start.
+/// TSFs and luminance of `frames` (two or more, of one size), from the best of `starts`, of one of which [`doubt`] may
+/// have `begun`. With `known.first`, the second level's first answer is the last one where it explains that frame or all
+/// frames no better than what is known: it will not be believed. `progress` returning `false` ends the work: `None`, as
+/// for no start.
 pub fn estimate(
     frames: &[Frame],
     starts: &[Start],
