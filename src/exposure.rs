@@ -16,6 +16,8 @@ pub struct Frame {
     pub chroma_subsampled: bool,
     /// Whether the file format drops what is fine and faint, and noise with it (JPEG).
     pub lossy: bool,
+    /// ISO speed, where the file notes it.
+    pub speed: Option<f64>,
     /// Exposure time Δt in seconds.
     pub exposure_time: f64,
 }

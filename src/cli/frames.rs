@@ -171,6 +171,7 @@ pub(super) fn load(paths: &[PathBuf], given: Option<Vec<f64>>, white: f32) -> cr
             levels: input.levels,
             chroma_subsampled: input.chroma_subsampled,
             lossy: input.lossy,
+            speed: input.metadata.iso,
             exposure_time,
         });
         to_xyz.push(input.to_xyz);

@@ -323,6 +323,7 @@ fn masks_at(frames: &[Frame], sharp: &[bool], alpha: f32, pixel: usize) -> Vec<f
             levels: f.levels,
             chroma_subsampled: f.chroma_subsampled,
             lossy: f.lossy,
+            speed: f.speed,
             exposure_time: f.exposure_time,
         }
     };

@@ -53,7 +53,7 @@ const ANCHOR: usize = 128;
 ///         let irradiance = (y * 64 + x) as f64 / 2000.0;
 ///         ((irradiance * exposure_time).min(1.0).sqrt() * 255.0).round() as f32 / 255.0
 ///     });
-///     Frame { name: format!("{exposure_time} s"), intensity: Rgb([ramp.clone(), ramp.clone(), ramp]), levels: 255, chroma_subsampled: false, lossy: false, exposure_time }
+///     Frame { name: format!("{exposure_time} s"), intensity: Rgb([ramp.clone(), ramp.clone(), ramp]), levels: 255, chroma_subsampled: false, lossy: false, speed: None, exposure_time }
 /// });
 /// let response = calibrate(&Bracket::new(frames.to_vec())?)?;
 /// assert!((response.inverse(1, 0.5) - 0.25).abs() < 0.01);

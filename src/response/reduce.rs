@@ -50,6 +50,7 @@ pub fn reduced(bracket: &Bracket, response: &Response, divisor: usize) -> Result
             levels: (f.levels * divisor as u32).min(65535),
             chroma_subsampled: f.chroma_subsampled && divisor == 1,
             lossy: f.lossy,
+            speed: f.speed,
             exposure_time: f.exposure_time,
         }
     });

@@ -58,7 +58,7 @@ impl Camera {
                 .collect();
             Plane { width: plane.width, height: plane.height, data }
         });
-        Frame { name: name.into(), intensity: Rgb(planes), levels, chroma_subsampled: false, lossy: false, exposure_time }
+        Frame { name: name.into(), intensity: Rgb(planes), levels, chroma_subsampled: false, lossy: false, speed: None, exposure_time }
     }
 }
 

@@ -16,6 +16,7 @@ fn bracket(levels: [f32; 3]) -> Bracket {
         levels: 255,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     };
     Bracket::new(levels.into_iter().zip([0.1, 1.0, 4.0]).map(frame).collect()).unwrap()

@@ -274,6 +274,7 @@ fn real_frames_that_are_sharp_are_registered() {
                 levels: picture.levels,
                 chroma_subsampled: picture.chroma_subsampled,
                 lossy: picture.lossy,
+                speed: None,
                 exposure_time,
             }
         };

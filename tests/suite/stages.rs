@@ -46,6 +46,7 @@ fn the_noise_level_is_found_within_a_fifth() {
             levels: 65535,
             chroma_subsampled: false,
             lossy: false,
+            speed: None,
             exposure_time: 1.0,
         };
         let exposure = noise::exposure(&frame, &Response::Linear);
@@ -75,6 +76,7 @@ fn flat_fields(noise: &noise::NoiseModel, seed: u64, engine: impl Fn(Plane) -> P
         levels: 65535,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time: 1.0,
     }
 }
@@ -173,7 +175,15 @@ fn texture_that_another_frame_shows_is_not_noise() {
             })
         };
         let intensity = Rgb([plane(0), plane(1), plane(2)]);
-        Frame { name: k.to_string(), intensity, levels: 65535, chroma_subsampled: false, lossy: false, exposure_time: f64::from(gain) }
+        Frame {
+            name: k.to_string(),
+            intensity,
+            levels: 65535,
+            chroma_subsampled: false,
+            lossy: false,
+            speed: None,
+            exposure_time: f64::from(gain),
+        }
     };
     let places = [(0.0f32, 0.0f32), (5.5, -3.25), (-4.3, 2.6)];
     let frames = [frame(0, places[0], 1.0, 1), frame(1, places[1], 1.4, 1), frame(2, places[2], 1.2, 6)];
@@ -204,6 +214,7 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
         levels: 255,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     };
     let one = |frames: &[Frame], sharp: &[bool]| {
@@ -231,7 +242,8 @@ fn masks_fall_towards_clipping_and_vanish_where_a_channel_clips() {
 fn what_is_clipped_in_some_channels_counts_by_the_grey_of_all() {
     let pixels = [[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 1.0, 0.5], [1.0; 3], [0.0; 3], [1.0, 0.99, 0.2]];
     let intensity = Rgb([0, 1, 2].map(|c| Plane { width: pixels.len(), height: 1, data: pixels.iter().map(|p| p[c]).collect() }));
-    let frame = Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, lossy: false, exposure_time: 1.0 };
+    let frame =
+        Frame { name: "one".into(), intensity, levels: 255, chroma_subsampled: false, lossy: false, speed: None, exposure_time: 1.0 };
     let mask = Plane { width: pixels.len(), height: 1, data: vec![0.8, 0.0, 0.0, 0.0, 0.0, 0.0] };
     let found = mask::with_partly_clipped(&mask, &frame, &mask::spoilt_channels(&frame), 0.3, |_| 0.5).data;
     // Greys of 0.65, 0.943 and 0.903: the first in the flat part of the window, the others 0.057 and 0.097 from its end.
@@ -298,6 +310,7 @@ fn a_blur_is_looked_for_in_the_channels_that_tell_of_it() {
                 levels: 65535,
                 chroma_subsampled: false,
                 lossy: false,
+                speed: None,
                 exposure_time,
             }
         };
