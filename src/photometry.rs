@@ -3,7 +3,7 @@
 //! Frame i shows x_ic(p) = g_ic Δt_i E_c(p) + o_ic, where g is 1 and o is 0 if file and camera agree. Both are found on means of squares of registered frames, which
 //! blur and small errors of registration hardly change where the neighbouring squares are as bright. E is the weighted mean of all frames under
 //! the present g and o; each frame is then regressed on it, in turn, robustly and with priors: ln g of a channel is 0 ± [`GAIN`], with the heavy tail of a
-//! file that notes something else; o is one [`OFFSET`] for all frames of a camera, and each frame's differs from that by [`OWN_OFFSET`].
+//! file that notes something else; o is one [`OFFSET`] for all frames and channels of a camera, and each one's differs from that by [`OWN_OFFSET`].
 //! What all frames have in common cannot be seen: on average over the light that they hold, g is 1.
 
 use crate::exposure::Frame;
@@ -18,17 +18,20 @@ use serde::Serialize;
 
 /// Standard deviation of ln g: a tenth of an EV of white balance and as much of the shutter.
 const GAIN: f64 = 0.1;
-/// Standard deviation of the offset that all frames share, and of what a frame adds to it; parts of white.
-const OFFSET: f64 = 4e-3;
-const OWN_OFFSET: f64 = 1e-3;
+/// Standard deviation of the offset that all frames and channels share (six levels at black of an 8-bit sRGB file; random cameras have 0 to 3e-3), and of what one frame and channel adds to it;
+/// parts of white. On 80 random brackets these, with [`SQUARES`], have the least error of those that were tried (offsets: 5.0e-4 to 1.1e-3 by kind of file, 7.8e-4 to 1.2e-3 with 4e-3 and 1e-3 for each
+/// channel by itself).
+const OFFSET: f64 = 1.5e-3;
+const OWN_OFFSET: f64 = 5e-4;
 /// Relative error of a square's mean that noise does not explain: curve, engine, flare.
 const MODEL: f64 = 0.03;
 /// Standard deviation of all squares of like brightness together, as the same curve and engine are behind them: so many squares at most count as independent.
 const INDEPENDENT: f64 = 60.0;
 /// Part of the difference to the neighbouring squares that blur and displacement move into one.
 const MOVED: f64 = 0.3;
-/// The longer side holds so many squares, and a square has at least so many pixels a side.
-const SQUARES: usize = 60;
+/// The longer side holds so many squares, and a square has at least so many pixels a side. A shaken frame shows less contrast between small squares than a sharp one, which regression takes for a
+/// gain above 1 and an offset below 0.
+const SQUARES: usize = 30;
 const LEAST_SIDE: usize = 5;
 /// A square of which more than this part reads 0 hides its mean.
 const BLACK: f64 = 0.02;
@@ -80,18 +83,17 @@ pub fn photometry(frames: &[Frame], exposures: &[Rgb], noise: &[FrameNoise], ids
     if ids.len() < 2 {
         return found;
     }
-    let channels: Vec<(Vec<f64>, Vec<f64>, Vec<usize>)> = (0..3)
-        .into_par_iter()
-        .map(|c| {
-            let squares: Vec<Vec<Option<Square>>> =
-                ids.iter().map(|&i| squares(&frames[i], &exposures[i], &noise[i], c, &motions[i])).collect();
-            let times: Vec<f64> = ids.iter().map(|&i| frames[i].exposure_time).collect();
-            one_channel(&squares, &times)
-        })
-        .collect();
-    for (c, (gains, offsets, counts)) in channels.into_iter().enumerate() {
+    let times: Vec<f64> = ids.iter().map(|&i| frames[i].exposure_time).collect();
+    let of = |c: usize| Channel::new(ids.iter().map(|&i| squares(&frames[i], &exposures[i], &noise[i], c, &motions[i])).collect());
+    let mut channels: Vec<Channel> = (0..3).into_par_iter().map(of).collect();
+    for _ in 0..ROUNDS {
+        let sum: f64 = channels.iter().flat_map(|c| &c.offsets).sum();
+        let common = sum / ((3 * ids.len()) as f64 + (OWN_OFFSET / OFFSET).powi(2));
+        channels.par_iter_mut().for_each(|c| c.improve(&times, common));
+    }
+    for (c, channel) in channels.iter().enumerate() {
         for (k, &i) in ids.iter().enumerate() {
-            (found[i].gain[c], found[i].offset[c], found[i].squares[c]) = (gains[k], offsets[k], counts[k]);
+            (found[i].gain[c], found[i].offset[c], found[i].squares[c]) = (channel.gains[k], channel.offsets[k], channel.counts[k]);
         }
     }
     found
@@ -150,38 +152,54 @@ fn squares(frame: &Frame, exposure: &Rgb, noise: &FrameNoise, c: usize, motion: 
         .collect()
 }
 
-/// Gain, offset and number of squares of each frame.
-fn one_channel(squares: &[Vec<Option<Square>>], times: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<usize>) {
-    let (n, count) = (squares.len(), squares[0].len());
-    let shared: Vec<usize> = (0..count).filter(|&p| squares.iter().filter(|s| s[p].is_some()).count() >= 2).collect();
-    let counts: Vec<usize> = squares.iter().map(|s| shared.iter().filter(|&&p| s[p].is_some()).count()).collect();
-    let (mut gains, mut offsets) = (vec![1.0; n], vec![0.0; n]);
-    for _ in 0..ROUNDS {
-        // Radiance of each square.
-        let radiance: Vec<f64> = shared
-            .iter()
-            .map(|&p| {
-                let (mut sum, mut total) = (0.0, 0.0);
-                for (k, s) in squares.iter().enumerate() {
-                    if let Some(s) = s[p] {
-                        let scale = gains[k] * times[k];
-                        let weight = (scale * scale) / (s.deviation.powi(2) + (MODEL * s.mean).powi(2) + OWN_OFFSET * OWN_OFFSET);
-                        sum += weight * (s.mean - offsets[k]) / scale;
-                        total += weight;
-                    }
+/// What is known of one channel of all frames.
+struct Channel {
+    /// Of each frame.
+    squares: Vec<Vec<Option<Square>>>,
+    /// Those that two frames show.
+    shared: Vec<usize>,
+    /// Of each frame, how many of these it shows.
+    counts: Vec<usize>,
+    gains: Vec<f64>,
+    offsets: Vec<f64>,
+}
+
+impl Channel {
+    fn new(squares: Vec<Vec<Option<Square>>>) -> Self {
+        let (n, count) = (squares.len(), squares[0].len());
+        let shared: Vec<usize> = (0..count).filter(|&p| squares.iter().filter(|s| s[p].is_some()).count() >= 2).collect();
+        let counts = squares.iter().map(|s| shared.iter().filter(|&&p| s[p].is_some()).count()).collect();
+        Self { squares, shared, counts, gains: vec![1.0; n], offsets: vec![0.0; n] }
+    }
+
+    /// Radiance of each shared square under the present gains and offsets.
+    fn radiance(&self, times: &[f64]) -> Vec<f64> {
+        let of = |&p: &usize| {
+            let (mut sum, mut total) = (0.0, 0.0);
+            for (k, s) in self.squares.iter().enumerate() {
+                if let Some(s) = s[p] {
+                    let scale = self.gains[k] * times[k];
+                    let weight = (scale * scale) / (s.deviation.powi(2) + (MODEL * s.mean).powi(2) + OWN_OFFSET * OWN_OFFSET);
+                    sum += weight * (s.mean - self.offsets[k]) / scale;
+                    total += weight;
                 }
-                (sum / total).max(0.0)
-            })
-            .collect();
-        let common = offsets.iter().sum::<f64>() / (n as f64 + (OWN_OFFSET / OFFSET).powi(2));
-        for k in 0..n {
+            }
+            (sum / total).max(0.0)
+        };
+        self.shared.iter().map(of).collect()
+    }
+
+    /// Gain and offset of each frame, the radiances being what they are now; `common`: the offset of all frames and channels.
+    fn improve(&mut self, times: &[f64], common: f64) {
+        let radiance = self.radiance(times);
+        for k in 0..times.len() {
             // Unknown: ln g and o, linearised at the present values.
             let (mut a, mut b) = ([[0.0f64; 2]; 2], [0.0f64; 2]);
-            let tempered = (INDEPENDENT / counts[k].max(1) as f64).min(1.0);
-            for (&p, e) in shared.iter().zip(&radiance) {
-                let Some(s) = squares[k][p] else { continue };
-                let expected = gains[k] * times[k] * e;
-                let r = s.mean - expected - offsets[k];
+            let tempered = (INDEPENDENT / self.counts[k].max(1) as f64).min(1.0);
+            for (&p, e) in self.shared.iter().zip(&radiance) {
+                let Some(s) = self.squares[k][p] else { continue };
+                let expected = self.gains[k] * times[k] * e;
+                let r = s.mean - expected - self.offsets[k];
                 let w = tempered * precision(r, s.deviation.hypot(MODEL * expected.max(s.mean)));
                 let row = [expected, 1.0];
                 for i in 0..2 {
@@ -191,22 +209,21 @@ fn one_channel(squares: &[Vec<Option<Square>>], times: &[f64]) -> (Vec<f64>, Vec
                     b[i] += w * row[i] * r;
                 }
             }
-            let log = gains[k].ln();
+            let log = self.gains[k].ln();
             let prior = precision(log, GAIN);
             a[0][0] += prior;
             b[0] -= prior * log;
             a[1][1] += OWN_OFFSET.powi(-2);
-            b[1] -= (offsets[k] - common) * OWN_OFFSET.powi(-2);
+            b[1] -= (self.offsets[k] - common) * OWN_OFFSET.powi(-2);
             let det = a[0][0] * a[1][1] - a[0][1] * a[1][0];
             let step = (a[1][1] * b[0] - a[0][1] * b[1]) / det;
-            gains[k] *= step.clamp(-0.7, 0.7).exp();
-            offsets[k] = (offsets[k] + (a[0][0] * b[1] - a[1][0] * b[0]) / det).clamp(-3.0 * OFFSET, 3.0 * OFFSET);
+            self.gains[k] *= step.clamp(-0.7, 0.7).exp();
+            self.offsets[k] = (self.offsets[k] + (a[0][0] * b[1] - a[1][0] * b[0]) / det).clamp(-3.0 * OFFSET, 3.0 * OFFSET);
         }
         // The light that a frame holds: white and channel balance are those of the frames that hold most of it.
-        let light = |k: usize| squares[k].iter().flatten().map(|s| s.mean).sum::<f64>();
-        let total: f64 = (0..n).map(light).sum();
-        let mean = (0..n).map(|k| light(k) / total.max(f64::MIN_POSITIVE) * gains[k].ln()).sum::<f64>();
-        gains.iter_mut().for_each(|g| *g *= (-mean).exp());
+        let light = |k: usize| self.squares[k].iter().flatten().map(|s| s.mean).sum::<f64>();
+        let total: f64 = (0..times.len()).map(light).sum();
+        let mean = (0..times.len()).map(|k| light(k) / total.max(f64::MIN_POSITIVE) * self.gains[k].ln()).sum::<f64>();
+        self.gains.iter_mut().for_each(|g| *g *= (-mean).exp());
     }
-    (gains, offsets, counts)
 }
