@@ -579,6 +579,7 @@ fn office_is_calibrated_and_merged() {
             levels: p.levels,
             chroma_subsampled: p.chroma_subsampled,
             lossy: p.lossy,
+            speed: None,
             exposure_time,
         }
     });

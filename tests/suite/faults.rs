@@ -425,6 +425,7 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
             lossy: picture.lossy,
+            speed: None,
             exposure_time,
         }
     };
@@ -451,6 +452,7 @@ fn a_blur_that_explains_nothing_is_not_undone() {
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
             lossy: picture.lossy,
+            speed: None,
             exposure_time,
         }
     };

@@ -60,6 +60,7 @@ fn photographed(
             levels: 4095,
             chroma_subsampled: false,
             lossy: false,
+            speed: None,
             exposure_time: TIMES[i],
         }
     };
@@ -210,6 +211,7 @@ fn frames_of_any_size_are_compared() {
             levels: 255,
             chroma_subsampled: false,
             lossy: false,
+            speed: None,
             exposure_time,
         };
         let frames = [frame(1.0), frame(2.0)];

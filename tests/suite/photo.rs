@@ -723,6 +723,7 @@ fn layers_lie_on_the_pixels_of_the_result() {
                 levels: 65535,
                 chroma_subsampled: false,
                 lossy: false,
+                speed: None,
                 exposure_time: time,
             }
         };

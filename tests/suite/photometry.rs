@@ -34,6 +34,7 @@ fn frame(exposure_time: f64, motion: DVec2, seed: u64, changed: impl Fn(usize, f
         levels: 65535,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     }
 }

@@ -46,6 +46,7 @@ fn office_agrees_with_opencv() {
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
             lossy: picture.lossy,
+            speed: None,
             exposure_time,
         }
     });
@@ -82,7 +83,15 @@ fn noisy_bracket(f: fn(f64) -> f64, width: usize, height: usize, full_well: f64,
             })
         };
         let intensity = Rgb([1.0, 0.7, 0.4].map(|gain| plane(gain, &mut noise)));
-        Frame { name: format!("{exposure_time:.3}"), intensity, levels: 255, chroma_subsampled: false, lossy: false, exposure_time }
+        Frame {
+            name: format!("{exposure_time:.3}"),
+            intensity,
+            levels: 255,
+            chroma_subsampled: false,
+            lossy: false,
+            speed: None,
+            exposure_time,
+        }
     });
     Bracket::new(frames.to_vec()).unwrap()
 }
@@ -156,6 +165,7 @@ fn frames_that_share_no_shades_are_refused() {
         levels: 255,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     };
     let error = calibrate(&Bracket::new(vec![frame(0.0, 0.001), frame(0.5, 1.0)]).unwrap()).unwrap_err().to_string();
@@ -330,6 +340,7 @@ fn frames_that_share_no_shade_give_the_curve_of_an_average_camera() {
         levels: 255,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     };
     let of = |times: [f64; 2]| automatic(&Bracket::new(vec![frame(0.0, times[0]), frame(1.0, times[1])]).unwrap());
@@ -401,6 +412,7 @@ fn correct_real_brackets_raise_no_alarm() {
             levels: picture.levels,
             chroma_subsampled: picture.chroma_subsampled,
             lossy: picture.lossy,
+            speed: None,
             exposure_time,
         }
     });

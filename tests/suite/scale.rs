@@ -207,6 +207,7 @@ fn frames(size: (usize, usize), value: impl Fn(usize, usize) -> f32 + Copy + Syn
         levels: 255,
         chroma_subsampled: false,
         lossy: false,
+        speed: None,
         exposure_time,
     };
     Bracket::new(vec![frame("a.png", 0.5, 0.5), frame("b.png", 1.0, 1.0)]).expect("a bracket")

@@ -265,6 +265,7 @@ fn subsampled_colour_is_spoilt_beside_clipped_pixels() {
         levels: 255,
         chroma_subsampled,
         lossy: true,
+        speed: None,
         exposure_time: 1.0,
     };
     for (subsampled, reach) in [(false, 0), (true, 1)] {
