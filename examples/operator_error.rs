@@ -99,7 +99,7 @@ fn main() -> Result<(), Failure> {
             let p = ldr::read(&folder.join(&name))?;
             let exposure_time = time.as_f64().ok_or("a frame without a time")?;
             let (intensity, levels) = (p.intensity, p.levels);
-            Ok(Frame { name, intensity, levels, chroma_subsampled: p.chroma_subsampled, lossy: p.lossy, exposure_time })
+            Ok(Frame { name, intensity, levels, chroma_subsampled: p.chroma_subsampled, lossy: p.lossy, speed: None, exposure_time })
         });
         let bracket = Bracket::new(frames.collect::<Result<_, Failure>>()?)?;
         let found = pipeline::merge(&bracket, &Response::Srgb, &Settings::default(), None, &mut |_| true)?;

@@ -192,13 +192,13 @@ impl Channel {
     /// Gain and offset of each frame, the radiances being what they are now; `common`: the offset of all frames and channels.
     fn improve(&mut self, times: &[f64], common: f64) {
         let radiance = self.radiance(times);
-        for k in 0..times.len() {
+        for (k, time) in times.iter().enumerate() {
             // Unknown: ln g and o, linearised at the present values.
             let (mut a, mut b) = ([[0.0f64; 2]; 2], [0.0f64; 2]);
             let tempered = (INDEPENDENT / self.counts[k].max(1) as f64).min(1.0);
             for (&p, e) in self.shared.iter().zip(&radiance) {
                 let Some(s) = self.squares[k][p] else { continue };
-                let expected = self.gains[k] * times[k] * e;
+                let expected = self.gains[k] * time * e;
                 let r = s.mean - expected - self.offsets[k];
                 let w = tempered * precision(r, s.deviation.hypot(MODEL * expected.max(s.mean)));
                 let row = [expected, 1.0];
