@@ -26,6 +26,7 @@ pub mod exposure;
 mod fft;
 pub mod ghosts;
 pub mod gpu;
+pub mod hot;
 pub mod image;
 pub mod io;
 pub mod kernels;

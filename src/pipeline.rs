@@ -13,6 +13,7 @@ use crate::response::Response;
 use crate::tsf::{Model, TsfFile};
 use glam::DMat3;
 use serde_json::Value;
+use std::cell::OnceCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -174,6 +175,8 @@ struct Run<'a> {
     memo: &'a mut Memo,
     stop: Option<Arc<AtomicBool>>,
     bracket: &'a Bracket,
+    /// The bracket without its hot pixels, once they are known.
+    repaired: &'a OnceCell<Bracket>,
     response: &'a Response,
     settings: &'a Settings,
     events: &'a mut dyn FnMut(Event) -> bool,
@@ -196,6 +199,8 @@ struct Run<'a> {
     registrations: Vec<Registration>,
     left_out: Vec<(String, String)>,
     degraded: Vec<String>,
+    /// Hot pixels that were replaced.
+    hot_pixels: usize,
     blind: Value,
     /// What each displaced sharp frame shows of structure finer than the latent grid, taken off its exposure; none before it is known.
     aliasing: Vec<Option<Rgb>>,
@@ -249,12 +254,14 @@ pub fn merge_with(
     let Prepared { corrected, exposures, noise, curves, exposure_errors } = prepare::prepared(memo, bracket, response, settings);
     let bracket = corrected.as_ref().unwrap_or(bracket);
     let n = bracket.frames().len();
+    let repaired = OnceCell::new();
     let mut run = Run {
         gpu,
         kernels,
         memo,
         stop,
         bracket,
+        repaired: &repaired,
         response,
         settings,
         events,
@@ -271,6 +278,7 @@ pub fn merge_with(
         registrations: vec![Registration::skipped(); n],
         left_out: Vec::new(),
         degraded: Vec::new(),
+        hot_pixels: 0,
         blind: Value::Null,
         aliasing: vec![None; n],
         scale: 1.0,

@@ -2,6 +2,7 @@
 
 use super::Run;
 use crate::error::Result;
+use crate::hot;
 use crate::image::Channels;
 use crate::mask;
 use crate::noise::FrameNoise;
@@ -22,6 +23,8 @@ pub(super) struct Placed {
     pub excluded: Vec<bool>,
     pub motions: Vec<DMat3>,
     pub registrations: Vec<Registration>,
+    /// Places of hot pixels.
+    pub hot: Vec<usize>,
     pub noise: Vec<FrameNoise>,
     pub photometry: Vec<FramePhotometry>,
     pub left_out: Vec<(String, String)>,
@@ -41,6 +44,8 @@ impl Run<'_> {
             }
         }
         let placed: Vec<usize> = used.iter().copied().filter(|&i| found[i].registered).collect();
+        let hot = hot::find(self.bracket.frames(), &placed, &self.motions);
+        self.take_hot_pixels(&hot)?;
         let noise = self.noise_beside_each_other(&placed);
         let photometry = photometry::photometry(self.bracket.frames(), &self.exposures, &noise, &placed, &self.motions);
         let mut excluded = excluded.to_vec();
@@ -54,6 +59,7 @@ impl Run<'_> {
             excluded,
             motions: self.motions.clone(),
             registrations: found,
+            hot,
             noise,
             photometry,
             left_out: self.left_out.clone(),

@@ -97,8 +97,9 @@ impl Run<'_> {
         let settings = self.settings;
         self.memo.depends(&(&settings.exclude, &settings.sharp, settings.reference, settings.align));
         let placed = self.remembered("registration", "", |_| 0, |run| run.place(&used, &excluded, &known))?;
-        let Placed { excluded, motions, registrations, noise, photometry, left_out, degraded } = placed;
+        let Placed { excluded, motions, registrations, hot, noise, photometry, left_out, degraded } = placed;
         (self.motions, self.registrations, self.left_out, self.degraded) = (motions, registrations, left_out, degraded);
+        self.take_hot_pixels(&hot)?;
         self.take_photometry(noise, photometry);
         self.memo.depends(&(settings.alpha, settings.deghost, settings.blind, settings.deblur.interpolation));
         let doubtful = |i: usize| self.registrations[i].doubtful;

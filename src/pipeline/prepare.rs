@@ -4,6 +4,7 @@ use super::engine::Memo;
 use super::{Run, Settings};
 use crate::error::Result;
 use crate::exposure::{Bracket, Frame};
+use crate::hot;
 use crate::image::Rgb;
 use crate::noise::{self, FrameNoise};
 use crate::photometry;
@@ -108,6 +109,18 @@ impl Run<'_> {
     /// Standard deviations of the exposures' noise as pixels show it against their neighbours.
     pub(super) fn curves_of_detail(&self) -> Vec<[Vec<f32>; 3]> {
         self.curves_under(&self.noise.iter().map(FrameNoise::of_detail).collect::<Vec<_>>())
+    }
+
+    /// Replaces what the hot pixels at `places` spoil, once: exposures are as the files have them again.
+    pub(super) fn take_hot_pixels(&mut self, places: &[usize]) -> Result<()> {
+        if places.is_empty() || self.repaired.get().is_some() {
+            return Ok(());
+        }
+        let repaired = hot::repaired(self.bracket, places)?;
+        self.bracket = self.repaired.get_or_init(|| repaired);
+        self.exposures = self.bracket.frames().iter().map(|f| noise::exposure(f, self.response)).collect();
+        self.hot_pixels = places.len();
+        Ok(())
     }
 
     /// `noise` and `found` as noise and photometry of exposures that are as the files have them; from here on gain and black are taken off these.

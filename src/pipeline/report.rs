@@ -56,6 +56,7 @@ impl Run<'_> {
             "scale": { "rule": "value = irradiance * exposure time of the reference frame", "factor_s": scale },
             "blind": blind,
             "frames": entries,
+            "hot_pixels": self.hot_pixels,
             "degraded": self.degraded,
             "left_out": self.left_out.iter().map(|(frame, why)| json!({ "frame": frame, "reason": why })).collect::<Vec<_>>(),
             "solver": solution.report,
