@@ -356,15 +356,10 @@ impl WholeFrame<'_> {
         let fits = |l: &usize| *l == 0 || w.min(h) >> l >= SMALLEST;
         let mut found: Vec<Option<Estimate>> = vec![None; (0..sizes).filter(fits).count().max(1)];
         self.descend(search, &mut |frame, l, tsf, last| {
-            let here = || choose(frame, l, tsf, search);
-            if last {
-                // No finer size tells more.
-                let here = here();
-                for (k, finer) in found.iter_mut().enumerate().take(l + 1) {
-                    *finer = Some(here.clone().on_frame(k, l - k, &self.base));
-                }
-            } else if l < found.len() {
-                found[l] = Some(here().on_frame(l, 0, &self.base));
+            // Where a blur is so long that no finer size tells more, those tell nothing of their own.
+            let at = l.min(found.len() - 1);
+            if last || l == at {
+                found[at] = Some(choose(frame, l, tsf, search).on_frame(at, l - at, &self.base));
             }
         });
         found
