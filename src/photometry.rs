@@ -3,7 +3,7 @@
 //! Frame i shows x_ic(p) = g_ic Δt_i E_c(p) + o_ic, where g is 1 and o is 0 if file and camera agree. Both are found on means of squares of registered frames, which
 //! blur and small errors of registration hardly change where the neighbouring squares are as bright. E is the weighted mean of all frames under
 //! the present g and o; each frame is then regressed on it, in turn, robustly and with priors: ln g of a channel is 0 ± [`GAIN`], with the heavy tail of a
-//! file that notes something else; o is one [`OFFSET`] for all frames and channels of a camera, and each one's differs from that by [`OWN_OFFSET`].
+//! file that notes something else; o is one [`OFFSET`] for all frames and channels of a camera, and each one's differs from that by [`OWN_OFFSET`], with as heavy a tail.
 //! What all frames have in common cannot be seen: on average over the light that they hold, g is 1.
 
 use crate::exposure::Frame;
@@ -213,8 +213,10 @@ impl Channel {
             let prior = precision(log, GAIN);
             a[0][0] += prior;
             b[0] -= prior * log;
-            a[1][1] += OWN_OFFSET.powi(-2);
-            b[1] -= (self.offsets[k] - common) * OWN_OFFSET.powi(-2);
+            let own = self.offsets[k] - common;
+            let prior = precision(own, OWN_OFFSET);
+            a[1][1] += prior;
+            b[1] -= prior * own;
             let det = a[0][0] * a[1][1] - a[0][1] * a[1][0];
             let step = (a[1][1] * b[0] - a[0][1] * b[1]) / det;
             self.gains[k] *= step.clamp(-0.7, 0.7).exp();
