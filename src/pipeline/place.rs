@@ -44,7 +44,7 @@ impl Run<'_> {
             }
         }
         let placed: Vec<usize> = used.iter().copied().filter(|&i| found[i].registered).collect();
-        let hot = hot::find(self.bracket.frames(), &placed, &self.motions);
+        let hot = hot::find(&self.exposures, &self.curves, &placed, &self.motions);
         self.take_hot_pixels(&hot)?;
         let noise = self.noise_beside_each_other(&placed);
         let photometry = photometry::photometry(self.bracket.frames(), &self.exposures, &noise, &placed, &self.motions);

@@ -25,7 +25,7 @@ const TABLE: Table = &[
     ("noise", &["image", "exposure", "pose::project", "response::Response", "kernels::NOISE_STEPS"]),
     ("photometry", &["image::Rgb", "exposure::Frame", "mask::CLIPPED", "noise::FrameNoise", "pose::project", "robust::precision"]),
     ("mask", &["image", "exposure", "pose"]),
-    ("hot", &["error::Result", "image", "exposure", "pose::project"]),
+    ("hot", &["error::Result", "image", "exposure", "noise", "pose::nearest_pixel", "register", "random", "response"]),
     ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),
     ("merge", &["image", "exposure", "mask", "noise", "pose"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
