@@ -112,6 +112,18 @@ pub fn find(exposures: &[Rgb], curves: &[[Vec<f32>; 3]], ids: &[usize], motions:
     places
 }
 
+/// How many sites of a sensor `width` pixels wide show at `places`: demosaicing and an engine make spots of some, which differ between the channels by a pixel or two.
+pub fn sites(places: &[usize], width: usize) -> usize {
+    let near = |a: usize, b: usize| (a % width).abs_diff(b % width).max((a / width).abs_diff(b / width)) <= 2;
+    let mut kept: Vec<usize> = Vec::new();
+    for &p in places {
+        if !kept.iter().any(|&k| near(k, p)) {
+            kept.push(p);
+        }
+    }
+    kept.len()
+}
+
 /// The bracket with what demosaicing, and an engine where the files are lossy, spread of the hot pixels at `places` replaced by what is around.
 ///
 /// # Errors
@@ -210,6 +222,13 @@ mod tests {
     fn frames_in_one_place_tell_nothing() {
         let frames = [frame(0.1, &[(30.0, 20.0, 0.7)]), frame(0.4, &[(30.0, 20.0, 0.8)])];
         assert_eq!(found(&frames, CLEAN, &[DMat3::IDENTITY; 2]), Vec::<usize>::new());
+    }
+
+    #[test]
+    fn a_site_counts_once() {
+        let spot = [place(30, 20), place(29, 21), place(31, 21), place(30, 22)];
+        assert_eq!(sites(&spot, SIZE.0), 1);
+        assert_eq!(sites(&[place(79, 20), place(0, 21), place(40, 50)], SIZE.0), 3, "the next row begins at the other side");
     }
 
     #[test]

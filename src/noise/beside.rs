@@ -128,27 +128,18 @@ fn residual(own: &[f64], shown: &[f64], block: usize) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Random;
 
-    /// About normal: sums of twelve numbers that are evenly distributed, by a hash of their place.
-    fn normal(seed: u64) -> f64 {
-        let uniform = |k: u64| {
-            let mut v = (12 * seed + k).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-            for _ in 0..2 {
-                v = (v ^ (v >> 31)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-            }
-            (v >> 11) as f64 / (1u64 << 53) as f64
-        };
-        (0..12).map(uniform).sum::<f64>() - 6.0
+    /// So many numbers of mean 0 and variance 1.
+    fn normal(random: &mut Random, n: usize) -> Vec<f64> {
+        (0..n).map(|_| random.normal()).collect()
     }
 
     #[test]
     fn quantiles_of_blocks_are_those_of_white_noise() {
         for (side, block, of_noise) in BLOCKS {
-            let mut seed = 0;
-            let mut draw = |n: usize| -> Vec<f64> {
-                seed += n as u64;
-                (0..n as u64).map(|k| normal(seed + 7 + k)).collect()
-            };
+            let mut random = Random::new(7, side as u64);
+            let mut draw = |n: usize| normal(&mut random, n);
             let count = 3000;
             let one = |_| residual(&draw(block * block), &draw((block + 2) * (block + 2)), block).unwrap();
             let mut found: Vec<f64> = (0..count).map(one).collect();
@@ -162,7 +153,7 @@ mod tests {
     #[test]
     fn what_the_other_frame_shows_is_gone_and_a_flat_one_takes_nothing_off() {
         let (block, wide) = (6, 8);
-        let shown: Vec<f64> = (0..wide * wide).map(|k| normal(k as u64)).collect();
+        let shown = normal(&mut Random::new(7, 0), wide * wide);
         let at = |k: usize, dx: usize, dy: usize| shown[(k / block + dy) * wide + k % block + dx];
         let own = |k: usize| 0.3 + 1.4 * at(k, 1, 1) - 0.6 * at(k, 2, 0) + 0.1 * (k % block) as f64;
         let own: Vec<f64> = (0..block * block).map(own).collect();

@@ -119,7 +119,7 @@ impl Run<'_> {
         let repaired = hot::repaired(self.bracket, places)?;
         self.bracket = self.repaired.get_or_init(|| repaired);
         self.exposures = self.bracket.frames().iter().map(|f| noise::exposure(f, self.response)).collect();
-        self.hot_pixels = places.len();
+        self.hot_pixels = hot::sites(places, self.bracket.size().0);
         Ok(())
     }
 

@@ -22,10 +22,10 @@ const TABLE: Table = &[
     ("sampling", &["image"]),
     // The stages before the solver: none knows a GPU.
     ("response", &["error", "image", "exposure", "mask::CLIPPED", "noise", "robust::precision"]),
-    ("noise", &["image", "exposure", "pose::project", "response::Response", "kernels::NOISE_STEPS"]),
+    ("noise", &["image", "exposure", "pose::project", "random::Random", "response::Response", "kernels::NOISE_STEPS"]),
     ("photometry", &["image::Rgb", "exposure::Frame", "mask::CLIPPED", "noise::FrameNoise", "pose::project", "robust::precision"]),
     ("mask", &["image", "exposure", "pose"]),
-    ("hot", &["error::Result", "image", "exposure", "noise", "pose::nearest_pixel", "register", "random", "response"]),
+    ("hot", &["error::Result", "image", "exposure", "noise", "pose::nearest_pixel", "register", "random::Random", "response::Response"]),
     ("ghosts", &["image", "exposure", "mask", "noise", "pose::project", "sampling"]),
     ("merge", &["image", "exposure", "mask", "noise", "pose"]),
     ("baseline", &["error", "image", "exposure", "response", "mask", "merge", "noise", "gpu", "deblur", "tsf::Tsf", "kernels::Kernels"]),
