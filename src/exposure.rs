@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::image::Rgb;
+use rayon::prelude::*;
 
 /// One photograph of the bracket.
 #[derive(Clone, Debug)]
@@ -20,6 +21,22 @@ pub struct Frame {
     pub speed: Option<f64>,
     /// Exposure time Δt in seconds.
     pub exposure_time: f64,
+}
+
+/// Part of a channel's pixels that read its least value where noise is cut off there.
+const CUT_OFF: f64 = 0.005;
+
+impl Frame {
+    /// Intensity of each channel at which noise is cut off at black: its least value, where so many pixels read it that it is more than the darkest thing in sight (a file may add
+    /// a pedestal to black), else 0.
+    pub fn black(&self) -> [f32; 3] {
+        [0, 1, 2].map(|c| {
+            let data = &self.intensity.0[c].data;
+            let least = data.par_iter().copied().reduce(|| f32::INFINITY, f32::min);
+            let count = data.par_iter().filter(|&&z| z == least).count();
+            if count as f64 > CUT_OFF * data.len() as f64 { least.max(0.0) } else { 0.0 }
+        })
+    }
 }
 
 /// Two or more frames of one scene, of one size, at more than one exposure time, in command-line order.
@@ -109,5 +126,29 @@ impl Bracket {
     /// (width, height) of every frame.
     pub fn size(&self) -> (usize, usize) {
         self.frames[0].intensity.size()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Plane;
+
+    #[test]
+    fn black_is_where_noise_is_cut_off() {
+        // Noise of 0.02 about 0.01, cut off at black, on a pedestal; without; and a scene without black.
+        let noise = |i: usize| 0.07 * ((((i * 7919) % 1009) as f32) / 1009.0 - 0.5);
+        let frame = |value: &(dyn Fn(usize) -> f32 + Sync)| Frame {
+            name: "black".into(),
+            intensity: Rgb(std::array::from_fn(|_| Plane::from_fn(64, 48, |x, y| value(y * 64 + x)))),
+            levels: 65535,
+            chroma_subsampled: false,
+            lossy: false,
+            speed: None,
+            exposure_time: 1.0,
+        };
+        assert_eq!(frame(&|i| (0.01 + noise(i)).max(0.0) + 0.03).black(), [0.03; 3]);
+        assert_eq!(frame(&|i| (0.01 + noise(i)).max(0.0)).black(), [0.0; 3]);
+        assert_eq!(frame(&|i| 0.2 + noise(i)).black(), [0.0; 3]);
     }
 }

@@ -384,10 +384,11 @@ impl Levels {
 fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> Option<Estimated> {
     let Shown { frame, exposure } = shown;
     let planes = &frame.intensity.0;
-    let all = |test: &(dyn Fn(f32) -> bool + Sync), c: Range<usize>| -> Vec<bool> {
-        (0..planes[0].data.len()).into_par_iter().map(|p| c.clone().all(|c| test(planes[c].data[p]))).collect()
+    let all = |test: &(dyn Fn(usize, f32) -> bool + Sync), c: Range<usize>| -> Vec<bool> {
+        (0..planes[0].data.len()).into_par_iter().map(|p| c.clone().all(|c| test(c, planes[c].data[p]))).collect()
     };
-    let counts = |c: Range<usize>| Counts { clear: all(&is_clear, c.clone()), black: all(&|z| z <= 0.0, c) };
+    let black = frame.black();
+    let counts = |c: Range<usize>| Counts { clear: all(&|_, z| is_clear(z), c.clone()), black: all(&|c, z| z <= black[c], c) };
     let own: [Counts; 3] = std::array::from_fn(|c| counts(c..c + 1));
     let of_all = counts(0..3);
     let quantum: [_; 3] = std::array::from_fn(|c| quantisation(response, c, frame.levels));
@@ -446,7 +447,7 @@ fn level(model: &NoiseModel, samples: &[Sample]) -> f64 {
     samples.iter().map(|s| s.blocks * model.variance(s.exposure).ln()).sum::<f64>() / blocks.max(1.0)
 }
 
-/// Which pixels are clear of white, and which read 0.
+/// Which pixels are clear of white, and which are cut off at black.
 struct Counts {
     clear: Vec<bool>,
     black: Vec<bool>,

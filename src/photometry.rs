@@ -32,7 +32,7 @@ const MOVED: f64 = 0.3;
 /// gain above 1 and an offset below 0.
 const SQUARES: usize = 30;
 const LEAST_SIDE: usize = 5;
-/// A square of which more than this part reads 0 hides its mean.
+/// A square of which more than this part is cut off at black hides its mean.
 const BLACK: f64 = 0.02;
 /// Rounds of E, gains and offsets in turn.
 const ROUNDS: usize = 25;
@@ -110,6 +110,7 @@ fn squares(frame: &Frame, exposure: &Rgb, noise: &FrameNoise, c: usize, motion: 
     let (columns, rows) = (w / side, h / side);
     let centre = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
     let stride = side.div_ceil(16);
+    let cut_off = frame.black()[c];
     let mean = |k: usize| -> Option<f64> {
         let middle = DVec2::new((k % columns * side) as f64, (k / columns * side) as f64) + 0.5 * (side as f64 - 1.0);
         let at = (project(motion, middle - centre) + centre - 0.5 * (side as f64 - 1.0)).round();
@@ -124,7 +125,7 @@ fn squares(frame: &Frame, exposure: &Rgb, noise: &FrameNoise, c: usize, motion: 
                     return None;
                 }
                 sum += f64::from(exposure.0[c].at(i, j));
-                black += usize::from(frame.intensity.0[c].at(i, j) <= 0.0);
+                black += usize::from(frame.intensity.0[c].at(i, j) <= cut_off);
                 n += 1;
             }
         }

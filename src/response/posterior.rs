@@ -18,6 +18,9 @@ const COMMON: f64 = 0.04;
 /// Standard deviation of the black level that all frames share, and of what each frame's engine makes of it; parts of white.
 const BLACK: f64 = 2e-3;
 const OWN_BLACK: f64 = 4e-4;
+/// What noise that is cut off at black may add to a mean, in standard deviations of the noise at black that is left. At black itself it is 0.4 of the sensor's, but engines smooth noise after it was
+/// cut off, and what it added fades with the sensor's noise, not with what is left of that.
+const CUT_OFF: f64 = 2.0;
 /// Exposures below count as this one where the black level is taken off.
 const LEAST: f64 = 1e-3;
 /// Reweighting rounds.
@@ -105,7 +108,7 @@ pub(super) fn posterior(shades: &[Shade], times: &[f64], noise: &[FrameNoise], c
                 rows.push((
                     COMMON
                         .hypot(slope * s.deviation)
-                        .hypot(OWN_BLACK.hypot(noise[s.frame].channels[shade.channel].clipping_bias(value.exp())) * over),
+                        .hypot(OWN_BLACK.hypot(CUT_OFF * noise[s.frame].channels[shade.channel].read.sqrt()) * over),
                     row,
                     target,
                     value + over * found[black] - exposure,

@@ -13,7 +13,7 @@ const LEAST_SIDE: usize = 8;
 const LEAST_STILL: usize = 4;
 /// Of large frames every so-manyth pixel is looked at, that a row has about so many.
 const SAMPLED: usize = 1000;
-/// A block of which more than this part reads zero hides its mean: noise is cut off at black.
+/// A block of which more than this part is cut off at black hides its mean.
 const BLACK: f64 = 0.01;
 /// Shades below 4 of 255 say more about the black level than about the curve.
 pub(super) const DARKEST: f64 = 4.0 / 255.0;
@@ -129,6 +129,7 @@ fn means(
     let plane = &frame.intensity.0[channel];
     let stride = (plane.width.max(plane.height) / SAMPLED).max(1);
     let others = &frame.intensity.0;
+    let cut_off = frame.black()[channel];
     // Mean intensity of each block, and whether it is clipped or black.
     let mut blocks = Vec::with_capacity(columns * rows);
     for by in 0..rows {
@@ -146,7 +147,7 @@ fn means(
                     let z = plane.at(x, y);
                     n += 1.0;
                     sum += table[(z.clamp(0.0, 1.0) * STEPS as f32).round() as usize];
-                    black += usize::from(z <= 0.0);
+                    black += usize::from(z <= cut_off);
                     white |= others.iter().any(|p| p.at(x, y) >= CLIPPED);
                 }
             }

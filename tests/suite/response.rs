@@ -306,6 +306,34 @@ fn errors_of(bracket: &Bracket, response: &Response) -> Vec<(f64, f64)> {
     exposure_errors(bracket, response, &noise::estimate(bracket.frames(), &exposures, response))
 }
 
+/// A night of which the short frame is mostly noise: cut off at black, smoothed by the camera afterwards, and put on a pedestal. What that adds to its dark parts is no exposure.
+#[test]
+fn noise_that_is_cut_off_at_black_is_no_exposure() {
+    let scene = synth::room(240, 180, 24, 4);
+    for (read_noise, smoothed) in [(90.0, false), (90.0, true), (45.0, true)] {
+        let frame = |k: usize, time: f64, read_noise: f64| {
+            let camera = Camera { full_well: 2500.0, read_noise, bits: 16, ..Camera::default() };
+            let made = synth::capture(&scene, &camera, &[(time, None), (2.0 * time, None)], 0.06, 7 + k as u64).unwrap();
+            let mut frame = made.bracket.frames()[0].clone();
+            if smoothed {
+                frame.intensity = frame.intensity.map_planes(|p| p.box_sum(1).map(|v| v / 9.0));
+            }
+            frame.intensity = frame.intensity.map_planes(|p| p.map(|z| z.max(0.03)));
+            frame
+        };
+        let bracket = Bracket::new(vec![frame(0, 0.25, read_noise), frame(1, 1.0, 8.0), frame(2, 4.0, 2.0)]).unwrap();
+        let found = errors_of(&bracket, &Response::Srgb);
+        println!("read noise {read_noise} e-, smoothed {smoothed}: {found:?}");
+        for (ev, deviation) in &found {
+            assert!(ev.abs() < 0.35, "read noise {read_noise} e-, smoothed {smoothed}: {ev:+.2} EV, {deviation:.2} expected");
+        }
+        // What is known all the same stays known: an exposure that is off.
+        let off = with_times(&bracket, &[1.0, 4.0, 1.0]);
+        let found = errors_of(&off, &Response::Srgb);
+        assert!((found[1].0 - found[2].0 + 2.0).abs() < 0.35, "{found:?}");
+    }
+}
+
 /// EV by which the exposure that `found` gives code 128 differs from that of sRGB.
 fn middle_error(found: &Response) -> f64 {
     let z = 128.0 / 255.0;
