@@ -194,6 +194,8 @@ struct Run<'a> {
     ghosts: Vec<Option<Plane>>,
     /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
     looks: Vec<(Channels, Option<Plane>)>,
+    /// Whether stationary frames show structure as fine as their pixels, which an interpolation between them loses.
+    pixel_sharp: bool,
     /// Where each frame lies, from the reference (centred pixels), and how that was found.
     motions: Vec<DMat3>,
     registrations: Vec<Registration>,
@@ -274,6 +276,7 @@ pub fn merge_with(
         masks: Vec::new(),
         ghosts: vec![None; n],
         looks: Vec::new(),
+        pixel_sharp: false,
         motions: vec![DMat3::IDENTITY; n],
         registrations: vec![Registration::skipped(); n],
         left_out: Vec::new(),

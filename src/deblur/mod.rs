@@ -21,10 +21,12 @@
 //! residual-driven weights lowers the objective by less than `tolerance` of it, or at `outer` steps.
 
 mod aliasing;
+mod in_place;
 mod memory;
 mod prior;
 
 pub use aliasing::{TILE, aliasing};
+pub use in_place::on_own_pixels;
 pub use memory::Memory;
 pub use prior::Prior;
 

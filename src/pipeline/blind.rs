@@ -8,12 +8,15 @@ use crate::mask;
 use crate::merge;
 use crate::psf::{self, Patch, Psf};
 use crate::tsf::{self, Tsf};
+use glam::DMat3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
 /// Energy of differences over that of those twice as long, in the softest direction, below which a frame may have moved: sharp frames of the benchmark have 0.65, one that moved by 6 px
 /// 0.47. A soft lens has such edges too: being asked costs time alone.
 const SOFT: f64 = 0.55;
+/// The same above which structure is as fine as the pixels: cameras' frames have 0.25 to 0.48 (lens and mosaic), scenes that are sampled without a lens 0.52 to 0.61.
+const PIXEL_SHARP: f64 = 0.5;
 /// Longest differences that are looked at where shorter ones are noise, pixels.
 const LONGEST: usize = 4;
 /// Times its noise that a frame's energy has to be for its edges to tell.
@@ -221,7 +224,7 @@ impl Run<'_> {
     /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved by more than `stroke` pixels as well as all others; `None` where
     /// the edges of one of these are as hard as a sharp frame's.
     pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize], stroke: f64) -> Result<Option<(Doubt, Begun)>> {
-        if !still.iter().all(|&i| self.is_soft(i)) {
+        if !still.iter().all(|&i| self.hardness(i).is_some_and(|h| h < SOFT)) {
             return Ok(None);
         }
         self.remembered(
@@ -240,8 +243,16 @@ impl Run<'_> {
         )
     }
 
-    /// Whether the edges of frame `i` are as soft, in one direction at least, as a motion makes them.
-    pub(super) fn is_soft(&self, i: usize) -> bool {
+    /// Whether displaced ones of the stationary frames `still` show structure as fine as the pixels: the longest tells, which has least noise.
+    pub(super) fn is_pixel_sharp(&self, still: &[usize]) -> bool {
+        let displaced = still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
+        let longest = self.bracket.longest(still).filter(|_| displaced);
+        longest.and_then(|i| self.hardness(i)).is_some_and(|hardness| hardness > PIXEL_SHARP)
+    }
+
+    /// Energy of the differences of frame `i` over that of differences twice as long, in the direction in which that is least, at the shortest length at which they are clear of noise; `None` where
+    /// none are. Structure as fine as the pixels has about 0.7, a lens 0.3 to 0.5, a motion less in its direction.
+    pub(super) fn hardness(&self, i: usize) -> Option<f64> {
         let (x, noise) = (self.exposures[i].mean(), &self.noise[i]);
         let clipped = mask::clipped(&self.bracket.frames()[i], Channels::ALL);
         let (w, h) = x.size();
@@ -261,11 +272,12 @@ impl Run<'_> {
             };
             (0..h.saturating_sub(dy)).into_par_iter().map(row).reduce(|| [0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]])
         };
-        [(1, 0), (0, 1), (1, 1)].iter().any(|&(dx, dy)| {
+        let softness = |&(dx, dy): &(usize, usize)| -> Option<f64> {
             // The finest structure that is clear of noise tells.
             let clear = (1..=LONGEST).map(|k| (k, energy(k * dx, k * dy))).find(|(_, [one, noise])| *one > CLEAR * noise);
-            clear.is_some_and(|(k, [one, noise])| one - noise < SOFT * (energy(2 * k * dx, 2 * k * dy)[0] - noise))
-        })
+            clear.map(|(k, [one, noise])| (one - noise) / (energy(2 * k * dx, 2 * k * dy)[0] - noise).max(f64::MIN_POSITIVE))
+        };
+        [(1, 0), (0, 1), (1, 1)].iter().filter_map(softness).min_by(f64::total_cmp)
     }
 
     /// Masks by which the frame `i` alone counts.

@@ -3,12 +3,13 @@
 use super::Run;
 use crate::error::Result;
 use crate::hot;
-use crate::image::Channels;
+use crate::image::{Channels, Rgb};
 use crate::mask;
 use crate::noise::FrameNoise;
 use crate::photometry::{self, FramePhotometry};
 use crate::register::{self, Registrar, Registration};
 use glam::DMat3;
+use std::collections::BTreeMap;
 
 /// Part of the pixels that the best frame shows clear of noise and clipping which a frame has to show to be the first reference.
 const VISIBLE: f64 = 0.6;
@@ -83,26 +84,83 @@ impl Run<'_> {
         self.bracket.shortest(&enough)
     }
 
-    /// Where the frames `used` lie, by the longest of those that are `sharp` or, if most do not fit that, by the next.
+    /// Where the frames `used` lie, from the longest of those that are `sharp`, else from the first that shows enough. The frame whose pixels the
+    /// result is to lie on may be black: it is placed like any other, unless TSFs are `known`, which are about it, or as many frames fit it as fit any other.
     fn registered(&mut self, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
         let best = |run: &Self, of: &[usize]| {
             let still: Vec<usize> = of.iter().copied().filter(|&i| sharp[i]).collect();
             run.bracket.longest(&still).or_else(|| run.first_reference(of))
         };
-        let first = self.settings.reference.or_else(|| best(self, used)).unwrap_or(0);
-        let found = self.register_on(first, used, sharp, known)?;
-        // If most do not fit the first reference, it may be the one that is not of the scene.
+        let from = |run: &mut Self, first: usize| {
+            if sharp.contains(&true) || known.contains(&true) {
+                run.register_on(first, used, sharp, known)
+            } else {
+                run.register_through(first, used)
+            }
+        };
+        let wanted = self.settings.reference.filter(|_| known.contains(&true));
+        let first = wanted.or_else(|| best(self, used)).unwrap_or(0);
+        let mut found = from(self, first)?;
         let misfits = |r: &[Registration]| used.iter().filter(|&&i| !r[i].registered).count();
+        // If the frame on whose pixels the result is to lie does not fit, those that fit it may be what is asked for.
+        if let Some(asked) = self.settings.reference.filter(|&i| used.contains(&i) && !found[i].registered) {
+            let other = from(self, asked)?;
+            if misfits(&other) <= misfits(&found) {
+                found = other;
+            }
+        }
+        // If most do not fit the first reference, it may be the one that is not of the scene.
         if self.settings.reference.is_none() && used.len() > 2 && 2 * misfits(&found) >= used.len() {
             let rest: Vec<usize> = used.iter().copied().filter(|&i| i != first).collect();
             if let Some(second) = best(self, &rest) {
-                let other = self.register_on(second, used, sharp, known)?;
+                let other = from(self, second)?;
                 if misfits(&other) < misfits(&found) {
                     return Ok(other);
                 }
             }
         }
         Ok(found)
+    }
+
+    /// Where the frames `used` lie, from the frame `first`, of which none is known to be sharp: each beside the placed one that is nearest in exposure, or, where it does not fit
+    /// that, beside the next. Frames that share no shade, or of which one is too noisy or blurred, meet through those between them.
+    fn register_through(&mut self, first: usize, used: &[usize]) -> Result<Vec<Registration>> {
+        let exposures = std::mem::take(&mut self.exposures);
+        let found = self.registered_through(&exposures, first, used);
+        self.exposures = exposures;
+        found
+    }
+
+    fn registered_through(&mut self, exposures: &[Rgb], first: usize, used: &[usize]) -> Result<Vec<Registration>> {
+        let frames = self.bracket.frames();
+        let (w, h) = self.bracket.size();
+        let curves = self.curves_of_detail();
+        let registrar = |of: usize| Registrar::new(frames, exposures, &curves, of);
+        let mut placed = BTreeMap::from([(first, registrar(first))]);
+        let mut found = vec![Registration::skipped(); frames.len()];
+        found[first] = placed[&first].of_reference();
+        let distance = |a: usize, b: usize| (frames[a].exposure_time / frames[b].exposure_time).ln().abs();
+        let mut tried: Vec<(usize, usize)> = Vec::new();
+        loop {
+            let next = used
+                .iter()
+                .filter(|i| !placed.contains_key(i))
+                .flat_map(|&i| placed.keys().map(move |&by| (i, by)))
+                .filter(|pair| !tried.contains(pair))
+                .min_by(|a, b| distance(a.0, a.1).total_cmp(&distance(b.0, b.1)));
+            let Some((i, by)) = next else { return Ok(found) };
+            self.progress(&format!("registering {}", frames[i].name), 0.02)?;
+            let beside = placed.get_mut(&by).expect("a frame that is placed").register(i, false);
+            let worth = |r: &Registration| (r.registered && !r.assumed, r.registered, r.doubtful, r.agreement);
+            if !tried.iter().any(|t| t.0 == i) || worth(&beside) > worth(&found[i]) {
+                let motion = register::rebased(&beside.motion(), &found[by].motion(), w, h);
+                found[i] = Registration { homography: register::rows(&motion), ..beside };
+            }
+            tried.push((i, by));
+            if found[i].registered && !found[i].assumed {
+                placed.insert(i, registrar(i));
+            }
+        }
     }
 
     /// Where the frames `used` lie, from the frame `reference`.

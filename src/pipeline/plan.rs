@@ -9,14 +9,15 @@ use crate::blind::{self, Begun};
 use crate::deblur::{self, Solution};
 use crate::error::Result;
 use crate::image::Rgb;
+use crate::register;
 use crate::tsf::{self, Tsf, TsfFile};
 use glam::DMat3;
 use serde_json::Value;
 
 /// Rounds of TSFs refined against the deblurred irradiance and irradiance solved again.
 const ROUNDS: usize = 2;
-/// Outer iterations for stationary frames alone in one place. Where they are displaced they get as many as shaken ones: the start was resampled, which
-/// smooths, and the residual-driven weights come late.
+/// Outer iterations for stationary frames alone that lie in one place or are read there. Where they are displaced and sharp to the pixel they get as many as shaken ones: the start was
+/// resampled, which smooths, and the residual-driven weights come late.
 const STATIONARY_OUTER: usize = 3;
 
 /// What is known of a bracket while irradiance and blurs are looked for in turn.
@@ -38,6 +39,8 @@ pub(super) struct State {
     reduced: bool,
     /// Whether a frame has joined the stationary ones since these were solved for.
     joined: bool,
+    /// Whether what the stationary ones show was solved for with the settings of the result.
+    as_result: bool,
 }
 
 /// Why a frame is left out whose blur is looked for beside sharp ones that the user named.
@@ -135,6 +138,7 @@ impl Run<'_> {
             latent: None,
             reduced: false,
             joined: false,
+            as_result: false,
         })
     }
 
@@ -232,6 +236,7 @@ impl Run<'_> {
             }
         }
         self.scale = self.bracket.frames()[state.reference].exposure_time;
+        self.pixel_sharp = self.is_pixel_sharp(&state.still);
         self.find_ghosts(&state.still)?;
         let sharp: Vec<bool> = (0..self.bracket.frames().len()).map(|i| state.still.contains(&i)).collect();
         self.weigh(&sharp, &all);
@@ -242,7 +247,8 @@ impl Run<'_> {
     pub(super) fn solve_base(&mut self, state: &mut State) -> Result<Solution> {
         self.lay_out(state)?;
         let settings = self.stationary_settings(state);
-        let settings = if state.shaken.is_empty() { settings } else { for_estimates(&settings) };
+        state.as_result = state.shaken.is_empty();
+        let settings = if state.as_result { settings } else { for_estimates(&settings) };
         let own = format!("{:?} {:?}", state.still, state.shaken);
         let solved = self.solved("stationary frames", &own, &settings, |run| run.solve_stationary(state, None, &settings, (0.05, 0.10)))?;
         Ok(solved)
@@ -262,7 +268,7 @@ impl Run<'_> {
 
     fn stationary_settings(&self, state: &State) -> deblur::Settings {
         let displaced = state.still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
-        let outer = if displaced { self.settings.deblur.outer } else { STATIONARY_OUTER };
+        let outer = if displaced && self.pixel_sharp { self.settings.deblur.outer } else { STATIONARY_OUTER };
         deblur::Settings { outer, ..self.settings.deblur.clone() }
     }
 
@@ -288,6 +294,9 @@ impl Run<'_> {
     fn stationary_alone(&mut self, state: &mut State, base: Option<Solution>) -> Result<Solution> {
         let latent = state.latent.clone().expect("a scene is known by now");
         self.find_aliasing(&state.still, &state.shaken, &latent, 0.80, 0.90)?;
+        if let Some(solved) = base.as_ref().filter(|_| state.as_result && self.aliasing.iter().all(Option::is_none)) {
+            return Ok(solved.clone());
+        }
         let settings = self.stationary_settings(state);
         let own = format!("alone {:?}", state.still);
         self.solved("stationary frames", &own, &settings, |run| run.solve_stationary(state, base.as_ref(), &settings, (0.90, 0.98)))
@@ -343,20 +352,34 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// The frames `ids` count as they lie from here on: placed by all of their pixels, not by the middle of a blur.
+    /// The frames `ids` count as they lie from here on: all stationary ones are placed anew, by all of their pixels and beside each other, from the one that shows enough.
     pub(super) fn place_stationary(&mut self, state: &mut State, ids: &[usize]) -> Result<()> {
         for &i in ids {
             state.count_as_it_lies(i);
         }
+        if !self.settings.align {
+            return Ok(());
+        }
         let all = state.all();
         let sharp: Vec<bool> = (0..self.bracket.frames().len()).map(|i| state.still.contains(&i)).collect();
-        let (reference, given) = (state.reference, state.given.clone());
-        let own = format!("{ids:?} {all:?}");
-        let found = self.remembered("place", &own, |_| 0, |run| run.register_on(reference, &all, &sharp, &given))?;
-        for &i in ids.iter().filter(|&&i| found[i].registered) {
-            self.motions[i] = found[i].motion();
+        let given = state.given.clone();
+        let first = self.first_reference(&state.still).filter(|_| !given.contains(&true)).unwrap_or(state.reference);
+        let own = format!("{first} {ids:?} {all:?}");
+        let found = self.remembered("place", &own, |_| 0, |run| run.register_on(first, &all, &sharp, &given))?;
+        let anew = |i: usize| state.still.contains(&i) && found[i].registered && !found[i].assumed && !given[i];
+        let (w, h) = self.bracket.size();
+        let back = self.motions[first].inverse();
+        // From the first one; frames that are not placed anew lie beside it as before.
+        let from_first = |i: usize| if anew(i) { found[i].motion() } else { self.motions[i] * back };
+        let from_reference = from_first(state.reference).inverse();
+        let motions: Vec<DMat3> = (0..sharp.len()).map(|i| register::rebased(&from_first(i), &from_reference, w, h)).collect();
+        for i in (0..sharp.len()).filter(|&i| anew(i)) {
             self.registrations[i] = found[i].clone();
         }
+        for (motion, registration) in motions.iter().zip(&mut self.registrations) {
+            registration.homography = register::rows(motion);
+        }
+        self.motions = motions;
         Ok(())
     }
 

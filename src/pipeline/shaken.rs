@@ -49,6 +49,21 @@ impl Luminances {
     }
 }
 
+/// A frame that is looked at for whether it moved.
+pub(super) struct Looked {
+    luminances: Luminances,
+    base: DMat3,
+    search: Search,
+}
+
+impl Looked {
+    /// What motions in the image plane tell of it at 1, 1/2, 1/4 of the size; `None` where there is too little texture to tell.
+    pub(super) fn evidence(&self) -> Vec<Option<BlurEvidence>> {
+        let found = self.luminances.frame(self.base).estimates(&self.search, LOOKED_AT);
+        found.into_iter().map(|e| e.filter(tsf::Estimate::is_sound).map(|e| evidence(&e, self.luminances.latent.size()))).collect()
+    }
+}
+
 impl Run<'_> {
     /// Motion about which the poses of the blurred frame `i` are looked for: the search covers what is left.
     fn base(&self, i: usize) -> DMat3 {
@@ -123,15 +138,13 @@ impl Run<'_> {
         (Some(found.tsf), detail, Some(evidence))
     }
 
-    /// What motions in the image plane tell of whether the frame `i` moved beside the irradiance `latent`, which the frame `by` shows, at 1, 1/2, 1/4 of its size; `None` where
-    /// there is too little texture to tell.
-    pub(super) fn looked_at(&self, i: usize, latent: &Rgb, by: usize) -> Vec<Option<BlurEvidence>> {
+    /// What [`Looked::evidence`] is found from: the frame `i` beside the irradiance `latent`, which the frame `by` shows.
+    pub(super) fn looked_at(&self, i: usize, latent: &Rgb, by: usize) -> Looked {
         let search = Search { model: tsf::Model::Rigid, focal_px: self.settings.focal_px, stop: self.stop.clone() };
         let base = self.base(i);
         let mut luminances = self.luminances(i, latent, &base);
         self.forget_unshown(&mut luminances.weight, by, &base);
-        let found = luminances.frame(base).estimates(&search, LOOKED_AT);
-        found.into_iter().map(|e| e.filter(tsf::Estimate::is_sound).map(|e| evidence(&e, latent.size()))).collect()
+        Looked { luminances, base, search }
     }
 
     /// Sets the `weight` of a frame at `motion` to 0 where the frame `by`, in place, does not show what it sees.

@@ -109,6 +109,8 @@ impl Run<'_> {
             scenes[by] = Some(scene);
             Ok(found)
         };
-        Ok(Pair { forward: look(self, i, other)?, backward: look(self, other, i)? })
+        let (forward, backward) = (look(self, i, other)?, look(self, other, i)?);
+        let (forward, backward) = rayon::join(|| forward.evidence(), || backward.evidence());
+        Ok(Pair { forward, backward })
     }
 }

@@ -37,6 +37,8 @@ pub struct Registration {
     pub registered: bool,
     /// Whether a frame that is not registered may all the same lie where the motion says: a long blur leaves no part that tells by itself.
     pub doubtful: bool,
+    /// Whether nothing in the frame tells where it lies, so that it is taken to lie as what it was registered against.
+    pub assumed: bool,
     /// Kind of motion that the evidence asks for.
     pub model: Model,
     /// Homography from the reference to the frame, row by row: pixels, centres at integers, origin at the frame's centre.
@@ -61,6 +63,7 @@ impl Registration {
         Self {
             registered: true,
             doubtful: false,
+            assumed: false,
             model: Model::Identity,
             homography: rows(&DMat3::IDENTITY),
             method,
@@ -301,18 +304,18 @@ impl<'a> Registrar<'a> {
             let (share, count) = direct::explained(&tones[small].0, &tones[small].1, &DMat3::IDENTITY);
             count > SMOOTH_PIXELS && share > SMOOTH
         };
-        let (mut reason, mut doubtful) = (String::new(), false);
+        let (mut reason, mut doubtful, mut assumed) = (String::new(), false, false);
         let (mut model, mut motion) = (model, motion);
         if !fit.usable || parts < LEAST_TILES {
             if smooth() {
-                (model, motion) = (Model::Identity, DMat3::IDENTITY);
+                (model, motion, assumed) = (Model::Identity, DMat3::IDENTITY, true);
             } else {
                 reason =
                     "has too little structure in common with the other frames to be registered (--no-align takes it as it lies)".into();
             }
         } else if agreement < AGREEMENT || !self.plausible(&motion) {
             if smooth() {
-                (model, motion) = (Model::Identity, DMat3::IDENTITY);
+                (model, motion, assumed) = (Model::Identity, DMat3::IDENTITY, true);
             } else {
                 doubtful = !sharp && self.plausible(&motion);
                 reason = format!(
@@ -328,6 +331,7 @@ impl<'a> Registrar<'a> {
         Registration {
             registered,
             doubtful,
+            assumed,
             model,
             homography: rows(&motion),
             method,
@@ -335,7 +339,9 @@ impl<'a> Registrar<'a> {
             inliers: pairs.iter().filter(|p| (crate::pose::project(&levels[at].local(&motion), p.0) - p.1).length() < 2.0).count(),
             agreement,
             rms_px: residue,
-            reason: if registered {
+            reason: if assumed {
+                "shows too little to tell where it lies, and nothing that speaks against its lying in place".into()
+            } else if registered {
                 format!("moved by up to {moved:.2} px; {:.0} % of its parts agree", 100.0 * agreement)
             } else {
                 reason

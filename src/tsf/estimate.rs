@@ -534,14 +534,17 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, search: &Search) -> Estimate 
     }
     let one = Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose");
     let filters = Filters::of(frame);
-    let (mut in_place, mut moving, mut nothing) = (Vec::new(), Vec::new(), Vec::new());
-    for half in HeldOut::halves(&all, (w, h)) {
-        let still = fit(&half.inside, Model::Rigid, focal, &one, TRIAL);
-        let moved = fit(&half.inside, model, chosen_focal, &start, TRIAL);
-        in_place.extend(half.blocks(&filters.residual(frame, &half, &still)));
-        moving.extend(half.blocks(&filters.residual(frame, &half, &moved)));
-        nothing.extend(half.blocks(&frame.targets(&half.outside)));
-    }
+    let halves = HeldOut::halves(&all, (w, h));
+    let judged = |half: &HeldOut, model: Model, focal: f64, from: &Tsf| {
+        half.blocks(&filters.residual(frame, half, &fit(&half.inside, model, focal, from, TRIAL)))
+    };
+    let of_both = |model: Model, focal: f64, from: &Tsf| {
+        let (mut first, second) = rayon::join(|| judged(&halves[0], model, focal, from), || judged(&halves[1], model, focal, from));
+        first.extend(second);
+        first
+    };
+    let (in_place, moving) = rayon::join(|| of_both(Model::Rigid, focal, &one), || of_both(model, chosen_focal, &start));
+    let nothing: Vec<_> = halves.iter().flat_map(|half| half.blocks(&frame.targets(&half.outside))).collect();
     let than_still = Worse::than(&in_place, &moving);
     let blank_worse_by = Worse::than(&nothing, &moving).by;
     let (still_worse_by, still_error) = (than_still.by, than_still.error());

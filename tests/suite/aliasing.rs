@@ -4,13 +4,13 @@ use crate::oracle::blur;
 use crate::support::gpu::{gpu, kernels};
 use crate::support::{f64s, noise};
 use glam::DVec2;
-use unshaken::deblur::{Observation, Settings, TILE, aliasing, solve};
+use unshaken::deblur::{Observation, Settings, TILE, aliasing, on_own_pixels, solve};
 use unshaken::image::{Plane, Rgb};
-use unshaken::kernels::{NOISE_STEPS, STILL};
+use unshaken::kernels::{NOISE_STEPS, STILL, UNSEEN};
 use unshaken::metrics::{self, Judge};
 use unshaken::noise::NoiseModel;
 use unshaken::pipeline;
-use unshaken::pose::Pose;
+use unshaken::pose::{Pose, project};
 use unshaken::response::Response;
 use unshaken::synth::{self, Camera, Drawn, Motion, Scene};
 use unshaken::tsf::{TapSet, Tsf};
@@ -244,4 +244,68 @@ fn displaced_frames_denoise_as_those_in_place_do() {
     assert!((whole - in_place).abs() < 0.05 * in_place, "{whole} for {in_place}");
     // With the mean power for all frequencies it is three times as much. The interpolation's own losses are left.
     assert!(between < 1.6 * in_place, "{between} for {in_place}");
+}
+
+/// A soft pattern of period 11 px and longer, at a place in pixels from the grid's centre.
+fn soft(p: DVec2, c: usize) -> f64 {
+    0.4 + 0.1 * (0.57 * p.x + c as f64).sin() * (0.41 * p.y - 0.1 * p.x).cos()
+}
+
+#[test]
+fn a_soft_frame_is_read_at_the_pixels_of_the_latent_grid() {
+    for size in [(61, 44), (40, 40), (1, 1)] {
+        let middle = 0.5 * DVec2::new(size.0 as f64 - 1.0, size.1 as f64 - 1.0);
+        let from_centre = |x: usize, y: usize| DVec2::new(x as f64, y as f64) - middle;
+        for (x, y, turn) in [(0.0, 0.0, 0.0), (2.0, -3.0, 0.0), (3.3, -2.6, 1.5), (-0.5, 0.5, -2.0)] {
+            let motion = place(x, y, turn).centre();
+            let back = motion.inverse();
+            let plane = |c: usize| Plane::from_fn(size.0, size.1, |x, y| soft(project(&back, from_centre(x, y)), c) as f32);
+            let mut frame = Observation {
+                exposure: Rgb([plane(0), plane(1), plane(2)]),
+                mask: Plane::filled(size.0, size.1, 0.75),
+                exposure_time: TIME,
+                noise: std::array::from_fn(|_| vec![NOISE; NOISE_STEPS]),
+                black_clipped: false,
+                tsf: Tsf::still(motion),
+            };
+            let spoilt = (size.0 / 2, size.1 / 2);
+            frame.exposure.0[1].data[spoilt.1 * size.0 + spoilt.0] = UNSEEN;
+            let read = frame.in_place(&motion);
+            assert!(read.tsf.is_identity());
+            for j in 0..size.1 {
+                for i in 0..size.0 {
+                    let (k, q) = (j * size.0 + i, project(&motion, from_centre(i, j)) + middle);
+                    let inside = q.x >= 0.0 && q.y >= 0.0 && q.x <= size.0 as f64 - 1.0 && q.y <= size.1 as f64 - 1.0;
+                    assert_eq!(read.mask.data[k], if inside { 0.75 } else { 0.0 }, "mask at {i}, {j}");
+                    // Pixels beyond the border are not what the pattern is there.
+                    let far = |v: f64, n: usize| v >= 2.0 && v < n as f64 - 3.0;
+                    if far(q.x, size.0) && far(q.y, size.1) {
+                        for c in [0, 2] {
+                            let error = f64::from(read.exposure.0[c].data[k]) - soft(from_centre(i, j), c);
+                            assert!(error.abs() < 1.5e-3, "channel {c} at {i}, {j}: {error:.4} off");
+                        }
+                    }
+                    // The tap of a whole number of pixels is one pixel.
+                    let near = |v: f64, s: usize| v.fract() == 0.0 && v == s as f64 || v.fract() != 0.0 && (v - s as f64).abs() < 2.0;
+                    let unseen = !inside || near(q.x, spoilt.0) && near(q.y, spoilt.1);
+                    if (q - q.round()).abs().min_element() > 1e-6 || (q - q.round()).abs().max_element() == 0.0 {
+                        assert_eq!(read.exposure.0[1].data[k] == UNSEEN, unseen, "unseen at {i}, {j}, from {q}");
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_plane_of_the_latent_grid_is_seen_at_the_pixels_of_a_frame() {
+    let (w, h) = (50, 41);
+    let middle = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
+    let motion = place(4.25, -2.5, 1.0).centre();
+    let plane = Plane::from_fn(w, h, |x, y| (2.0 * x as f64 - 3.0 * y as f64) as f32);
+    let own = on_own_pixels(&plane, &motion);
+    for (x, y) in [(20, 20), (12, 30), (30, 9)] {
+        let q = project(&motion.inverse(), DVec2::new(x as f64, y as f64) - middle) + middle;
+        assert!((f64::from(own.at(x, y)) - (2.0 * q.x - 3.0 * q.y)).abs() < 1e-3, "at {x}, {y}");
+    }
 }

@@ -10,7 +10,7 @@ use unshaken::mask;
 use unshaken::metrics::{self, Judge};
 use unshaken::noise::NoiseModel;
 use unshaken::pipeline::{self, Blind, Outcome, Settings};
-use unshaken::pose::Pose;
+use unshaken::pose::{self, Pose};
 use unshaken::response::{self, Response};
 use unshaken::synth::{self, Camera, Drawn, SyntheticBracket, Tremor};
 use unshaken::tsf::{Tsf, TsfEntry, TsfFile};
@@ -212,6 +212,20 @@ fn a_soft_lens_is_not_taken_for_shake() {
     assert!(found.left_out.is_empty(), "{:?}", found.left_out);
 }
 
+/// The frame whose pixels the result is to lie on is black: the others are placed beside each other all the same, and count.
+#[test]
+fn a_black_reference_does_not_misplace_the_others() {
+    let displaced = |offset_px: f64| Some(Tremor { extent_px: 0.0, roll_deg: 0.0, offset_px, offset_deg: 0.0 });
+    let frames = [(1.0 / 4000.0, None), (1.0 / 8.0, displaced(9.0)), (0.4, displaced(7.0))];
+    let made = synth::capture(&synth::room(192, 144, 32, 5), &Camera::default(), &frames, 0.15, 5).unwrap();
+    let found = merge(&made.bracket, &Settings { reference: Some(0), ..settings() }, None);
+    let frames = found.report["frames"].as_array().unwrap();
+    assert!(frames[1]["sharp"] == true && frames[2]["sharp"] == true, "{:?}", judgements(&found));
+    let between = |places: [glam::DMat3; 2]| pose::project(&(places[1] * places[0].inverse()), glam::DVec2::ZERO);
+    let off = between([found.places[1], found.places[2]]) - between([made.tsfs[1].centre(), made.tsfs[2].centre()]);
+    assert!(off.length() < 0.5, "the second frame lies {off} px off beside the first: {:?}", frames[1]["registration"]);
+}
+
 /// What the program took each frame for.
 fn judgements(found: &Outcome) -> Vec<&serde_json::Value> {
     found.report["frames"].as_array().unwrap().iter().map(|f| &f["judgement"]).collect()
@@ -258,10 +272,9 @@ fn a_shaken_frame_that_shows_more_is_not_taken_for_the_sharp_one() {
     assert!(got > alone - 0.3, "{got:.2} dB, {alone:.2} without the shaken frame");
 }
 
-/// A blur so long that no part of the frame matches the sharp one places it, and its blur does; a frame of another scene, turned, is placed
-/// by neither.
+/// A blur so long that few parts of the frame match the sharp one's does not keep it from being placed; a frame of another scene, turned, is not.
 #[test]
-fn a_frame_shaken_too_far_for_its_parts_to_match_is_placed_by_its_blur() {
+fn a_frame_shaken_far_is_placed_and_one_of_another_scene_is_not() {
     let tremor = Tremor { extent_px: 24.0, roll_deg: 1.0, offset_px: 2.0, offset_deg: 0.1 };
     let scene = Drawn::Room.draw(192, 144, 64, 2, 1);
     let made = synth::capture(&scene, &Camera::default(), &[(1.0 / 30.0, None), (0.5, Some(tremor))], 0.05, 1).unwrap();
@@ -271,7 +284,6 @@ fn a_frame_shaken_too_far_for_its_parts_to_match_is_placed_by_its_blur() {
     let (got, alone) = (decibels(&found, &made.bracket, &made.truth), decibels(&alone, &made.bracket, &made.truth));
     let second = &found.report["frames"][1];
     println!("{got:.2} dB, {alone:.2} without the shaken frame; {}, {}", second["registration"], second["blur"]["blank_worse_by"]);
-    assert!(second["registration"]["agreement"].as_f64().unwrap() < 0.4, "its parts do not match: {}", second["registration"]);
     assert_eq!(second["used"], true, "{:?}", found.left_out);
     assert!(got > alone + 2.0, "{got:.2} dB, {alone:.2} without the shaken frame");
 
