@@ -451,10 +451,10 @@ fn what_sharp_frames_do_not_agree_about_is_no_motion() {
     }
 }
 
-/// A real pair: a frame of a phone drowned in noise beside a clean, shaken one. What of the blur is found beside noise explains less than nothing does, and ruins the
-/// clean frame.
+/// A real pair: a frame of a phone drowned in noise beside a clean, shaken one. The clean frame counts: as it lies, as a blur that is found beside noise explains less
+/// than nothing does, or by an estimate of both blurs that explains pixels it has not seen.
 #[test]
-fn a_blur_that_explains_nothing_is_not_undone() {
+fn a_clean_shaken_frame_counts_beside_noise() {
     let Some(folder) = shared("data/real") else { return };
     let read = |(name, exposure_time): (&str, f64)| {
         let picture = ldr::read(&folder.join(name)).unwrap();
@@ -472,5 +472,6 @@ fn a_blur_that_explains_nothing_is_not_undone() {
     let found = pipeline::merge(&bracket, &response::automatic(&bracket).response, &Settings::default(), None, &mut |_| true).unwrap();
     assert_eq!(found.left_out, vec![]);
     let long = &found.report["frames"][1];
-    assert_eq!((&long["used"], &long["sharp"]), (&true.into(), &true.into()), "{}", long["judgement"]);
+    assert_eq!(long["used"], true, "{}", long["judgement"]);
+    assert!(long["sharp"] == true || found.report["blind"]["believed"] == true, "{}", long["judgement"]);
 }
