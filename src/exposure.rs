@@ -23,19 +23,22 @@ pub struct Frame {
     pub exposure_time: f64,
 }
 
-/// Part of a channel's pixels that read its least value where noise is cut off there.
+/// Part of a channel's pixels that read its least value where noise is cut off there. Of 483 channels of random brackets without a pedestal none is taken for one that has it; of 255 with one, 57 show it
+/// so: the others hold little that is dark, or an engine has smoothed it.
 const CUT_OFF: f64 = 0.005;
 
 impl Frame {
-    /// Intensity of each channel at which noise is cut off at black: its least value, where so many pixels read it that it is more than the darkest thing in sight (a file may add
+    /// Intensity of `channel` at which noise is cut off at black: its least value, where so many pixels read it that it is more than the darkest thing in sight (a file may add
     /// a pedestal to black), else 0.
-    pub fn black(&self) -> [f32; 3] {
-        [0, 1, 2].map(|c| {
-            let data = &self.intensity.0[c].data;
-            let least = data.par_iter().copied().reduce(|| f32::INFINITY, f32::min);
-            let count = data.par_iter().filter(|&&z| z == least).count();
-            if count as f64 > CUT_OFF * data.len() as f64 { least.max(0.0) } else { 0.0 }
-        })
+    pub fn black(&self, channel: usize) -> f32 {
+        let data = &self.intensity.0[channel].data;
+        let least = |a: (f32, usize), b: (f32, usize)| match a.0 == b.0 {
+            true => (a.0, a.1 + b.1),
+            false if a.0 < b.0 => a,
+            false => b,
+        };
+        let (least, count) = data.par_iter().map(|&z| (z, 1)).reduce(|| (f32::INFINITY, 0), least);
+        if count as f64 > CUT_OFF * data.len() as f64 { least.max(0.0) } else { 0.0 }
     }
 }
 
@@ -147,8 +150,9 @@ mod tests {
             speed: None,
             exposure_time: 1.0,
         };
-        assert_eq!(frame(&|i| (0.01 + noise(i)).max(0.0) + 0.03).black(), [0.03; 3]);
-        assert_eq!(frame(&|i| (0.01 + noise(i)).max(0.0)).black(), [0.0; 3]);
-        assert_eq!(frame(&|i| 0.2 + noise(i)).black(), [0.0; 3]);
+        let black = |value: &(dyn Fn(usize) -> f32 + Sync)| [0, 1, 2].map(|c| frame(value).black(c));
+        assert_eq!(black(&|i| (0.01 + noise(i)).max(0.0) + 0.03), [0.03; 3]);
+        assert_eq!(black(&|i| (0.01 + noise(i)).max(0.0)), [0.0; 3]);
+        assert_eq!(black(&|i| 0.2 + noise(i)), [0.0; 3]);
     }
 }

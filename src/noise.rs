@@ -387,7 +387,7 @@ fn of_frame(shown: Shown, others: &[(Shown, DMat3)], response: &Response) -> Opt
     let all = |test: &(dyn Fn(usize, f32) -> bool + Sync), c: Range<usize>| -> Vec<bool> {
         (0..planes[0].data.len()).into_par_iter().map(|p| c.clone().all(|c| test(c, planes[c].data[p]))).collect()
     };
-    let black = frame.black();
+    let black = [0, 1, 2].map(|c| frame.black(c));
     let counts = |c: Range<usize>| Counts { clear: all(&|_, z| is_clear(z), c.clone()), black: all(&|c, z| z <= black[c], c) };
     let own: [Counts; 3] = std::array::from_fn(|c| counts(c..c + 1));
     let of_all = counts(0..3);

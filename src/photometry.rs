@@ -110,7 +110,7 @@ fn squares(frame: &Frame, exposure: &Rgb, noise: &FrameNoise, c: usize, motion: 
     let (columns, rows) = (w / side, h / side);
     let centre = 0.5 * DVec2::new(w as f64 - 1.0, h as f64 - 1.0);
     let stride = side.div_ceil(16);
-    let cut_off = frame.black()[c];
+    let cut_off = frame.black(c);
     let mean = |k: usize| -> Option<f64> {
         let middle = DVec2::new((k % columns * side) as f64, (k / columns * side) as f64) + 0.5 * (side as f64 - 1.0);
         let at = (project(motion, middle - centre) + centre - 0.5 * (side as f64 - 1.0)).round();

@@ -194,7 +194,7 @@ struct Run<'a> {
     ghosts: Vec<Option<Plane>>,
     /// The channels in which each frame's blur is looked for, and its mask by them where they are not all.
     looks: Vec<(Channels, Option<Plane>)>,
-    /// Whether stationary frames show structure as fine as their pixels, which an interpolation between them loses.
+    /// Whether stationary frames that are displaced show structure as fine as their pixels, which an interpolation between them loses.
     pixel_sharp: bool,
     /// Where each frame lies, from the reference (centred pixels), and how that was found.
     motions: Vec<DMat3>,

@@ -12,7 +12,8 @@ use crate::tsf::Tsf;
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
-/// Least exposure that is read between pixels: the negative lobes of the interpolation must not come near what stands for an unseen channel.
+/// Least exposure that is read between pixels, part of white: the interpolation's negative lobes reach -0.28 of an exposure beside black, which may be several times white where a frame's gain is taken off,
+/// and what is below -0.5 stands for an unseen channel. No frame shows less than -0.05.
 const LEAST: f32 = -0.1;
 
 fn centre((w, h): (usize, usize)) -> DVec2 {

@@ -125,10 +125,7 @@ impl Run<'_> {
     /// Where the frames `used` lie, from the frame `first`, of which none is known to be sharp: each beside the placed one that is nearest in exposure, or, where it does not fit
     /// that, beside the next. Frames that share no shade, or of which one is too noisy or blurred, meet through those between them.
     fn register_through(&mut self, first: usize, used: &[usize]) -> Result<Vec<Registration>> {
-        let exposures = std::mem::take(&mut self.exposures);
-        let found = self.registered_through(&exposures, first, used);
-        self.exposures = exposures;
-        found
+        self.beside_exposures(|run, exposures| run.registered_through(exposures, first, used))
     }
 
     fn registered_through(&mut self, exposures: &[Rgb], first: usize, used: &[usize]) -> Result<Vec<Registration>> {
@@ -165,22 +162,26 @@ impl Run<'_> {
 
     /// Where the frames `used` lie, from the frame `reference`.
     pub(super) fn register_on(&mut self, reference: usize, used: &[usize], sharp: &[bool], known: &[bool]) -> Result<Vec<Registration>> {
-        let frames = self.bracket.frames();
-        let mut found = vec![Registration::skipped(); frames.len()];
-        let exposures = std::mem::take(&mut self.exposures);
-        let curves = self.curves_of_detail();
-        let mut registrar = Registrar::new(frames, &exposures, &curves, reference);
-        found[reference] = registrar.of_reference();
-        let mut going = Ok(());
-        for i in registrar.order(used, sharp).into_iter().filter(|&i| !known[i]) {
-            going = self.progress(&format!("registering {}", frames[i].name), 0.02);
-            if going.is_err() {
-                break;
+        self.beside_exposures(|run, exposures| {
+            let frames = run.bracket.frames();
+            let mut found = vec![Registration::skipped(); frames.len()];
+            let curves = run.curves_of_detail();
+            let mut registrar = Registrar::new(frames, exposures, &curves, reference);
+            found[reference] = registrar.of_reference();
+            for i in registrar.order(used, sharp).into_iter().filter(|&i| !known[i]) {
+                run.progress(&format!("registering {}", frames[i].name), 0.02)?;
+                found[i] = registrar.register(i, sharp[i]);
             }
-            found[i] = registrar.register(i, sharp[i]);
-        }
+            Ok(found)
+        })
+    }
+
+    /// What `f` makes of the exposures, which a registrar reads while the run tells how far it is: until it is done the run has none.
+    fn beside_exposures<T>(&mut self, f: impl FnOnce(&mut Self, &[Rgb]) -> T) -> T {
+        let exposures = std::mem::take(&mut self.exposures);
+        let out = f(self, &exposures);
         self.exposures = exposures;
-        going.map(|()| found)
+        out
     }
 
     /// Motions from the frame `reference` instead.

@@ -246,7 +246,7 @@ impl Run<'_> {
     /// What the stationary frames show: masks, ghosts and their solution.
     pub(super) fn solve_base(&mut self, state: &mut State) -> Result<Solution> {
         self.lay_out(state)?;
-        let settings = self.stationary_settings(state);
+        let settings = self.stationary_settings();
         state.as_result = state.shaken.is_empty();
         let settings = if state.as_result { settings } else { for_estimates(&settings) };
         let own = format!("{:?} {:?}", state.still, state.shaken);
@@ -266,9 +266,8 @@ impl Run<'_> {
         Ok(Some(base))
     }
 
-    fn stationary_settings(&self, state: &State) -> deblur::Settings {
-        let displaced = state.still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
-        let outer = if displaced && self.pixel_sharp { self.settings.deblur.outer } else { STATIONARY_OUTER };
+    fn stationary_settings(&self) -> deblur::Settings {
+        let outer = if self.pixel_sharp { self.settings.deblur.outer } else { STATIONARY_OUTER };
         deblur::Settings { outer, ..self.settings.deblur.clone() }
     }
 
@@ -294,10 +293,11 @@ impl Run<'_> {
     fn stationary_alone(&mut self, state: &mut State, base: Option<Solution>) -> Result<Solution> {
         let latent = state.latent.clone().expect("a scene is known by now");
         self.find_aliasing(&state.still, &state.shaken, &latent, 0.80, 0.90)?;
-        if let Some(solved) = base.as_ref().filter(|_| state.as_result && self.aliasing.iter().all(Option::is_none)) {
-            return Ok(solved.clone());
-        }
-        let settings = self.stationary_settings(state);
+        let base = match base {
+            Some(solved) if state.as_result && self.aliasing.iter().all(Option::is_none) => return Ok(solved),
+            base => base,
+        };
+        let settings = self.stationary_settings();
         let own = format!("alone {:?}", state.still);
         self.solved("stationary frames", &own, &settings, |run| run.solve_stationary(state, base.as_ref(), &settings, (0.90, 0.98)))
     }

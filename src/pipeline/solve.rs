@@ -22,15 +22,13 @@ impl Run<'_> {
         to: f32,
     ) -> Result<Solution> {
         let (w, h) = self.bracket.size();
-        let tsf = |i: usize| tsfs[i].clone().unwrap_or_else(Tsf::identity);
-        // Frames that are read at the reference's pixels, and where they lie.
-        let read = |i: usize| tsf(i).single().filter(|_| !self.pixel_sharp && !tsf(i).is_identity());
-        let in_place: Vec<Option<DMat3>> = ids.iter().map(|&i| read(i)).collect();
-        let observation = |(&i, read): (&usize, &Option<DMat3>)| {
-            let own = self.observation(i, tsf(i));
-            if let Some(motion) = read { own.in_place(motion) } else { own }
+        // Displaced sharp frames that need no operator are read at the reference's pixels; where they lie.
+        let observed = |&i: &usize| {
+            let own = self.observation(i, tsfs[i].clone().unwrap_or_else(Tsf::identity));
+            let read = own.tsf.single().filter(|_| !self.pixel_sharp && !own.tsf.is_identity());
+            (if let Some(motion) = &read { own.in_place(motion) } else { own }, read)
         };
-        let mut observations: Vec<Observation> = ids.iter().zip(&in_place).map(observation).collect();
+        let (mut observations, read): (Vec<Observation>, Vec<Option<DMat3>>) = ids.iter().map(observed).unzip();
         if pad == 0 {
             observations.extend(self.at_the_border(ids, &observations));
         }
@@ -45,7 +43,7 @@ impl Run<'_> {
         let mut hear = |f: f32| events.borrow_mut()(Event::Progress { stage: stage.into(), fraction: from + (to - from) * f });
         let mut solved = deblur::solve_watched(self.gpu, self.kernels, &observations, initial, pad, settings, &mut watch, &mut hear)?;
         solved.misfit.truncate(ids.len());
-        for (misfit, motion) in solved.misfit.iter_mut().zip(&in_place) {
+        for (misfit, motion) in solved.misfit.iter_mut().zip(&read) {
             if let Some(motion) = motion {
                 *misfit = deblur::on_own_pixels(misfit, motion);
             }
@@ -77,9 +75,7 @@ impl Run<'_> {
     /// What the displaced ones of the sharp frames `still` show of structure finer than the latent grid, unless that is known. `latent`: irradiance as it
     /// is known. Progress runs from `from` to `to`.
     pub(super) fn find_aliasing(&mut self, still: &[usize], shaken: &[usize], latent: &Rgb, from: f32, to: f32) -> Result<()> {
-        let displaced = still.iter().any(|&i| self.motions[i] != DMat3::IDENTITY);
-        if !self.pixel_sharp || !self.settings.between_pixels || still.len() < 2 || !displaced || self.aliasing.iter().any(Option::is_some)
-        {
+        if !self.pixel_sharp || !self.settings.between_pixels || still.len() < 2 || self.aliasing.iter().any(Option::is_some) {
             return Ok(());
         }
         let settings = for_estimates(&self.settings.deblur);

@@ -129,7 +129,7 @@ fn means(
     let plane = &frame.intensity.0[channel];
     let stride = (plane.width.max(plane.height) / SAMPLED).max(1);
     let others = &frame.intensity.0;
-    let cut_off = frame.black()[channel];
+    let cut_off = frame.black(channel);
     // Mean intensity of each block, and whether it is clipped or black.
     let mut blocks = Vec::with_capacity(columns * rows);
     for by in 0..rows {
