@@ -532,11 +532,15 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, search: &Search) -> Estimate 
             source = "found";
         }
     }
-    let one = Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose");
+    // Where the frame lies as it was placed, or in the middle of the motion, which may be far from it: what explains it better.
+    let evidence = Evidence::new(frame, &all);
+    let poses = [Tsf { focal_px: start.focal_px, ..Tsf::identity() }, Tsf::new(start.focal_px, vec![start.mean()]).expect("one pose")];
+    let one = poses.into_iter().min_by(|a, b| evidence.misfit(a).total_cmp(&evidence.misfit(b))).expect("two poses");
     let filters = Filters::of(frame);
     let halves = HeldOut::halves(&all, (w, h));
     let judged = |half: &HeldOut, model: Model, focal: f64, from: &Tsf| {
-        half.blocks(&filters.residual(frame, half, &fit(&half.inside, model, focal, from, TRIAL)))
+        let residual = filters.residual(frame, half, &fit(&half.inside, model, focal, from, TRIAL));
+        half.blocks_with_gains(&frame.targets(&half.outside), &residual)
     };
     let of_both = |model: Model, focal: f64, from: &Tsf| {
         let (mut first, second) = rayon::join(|| judged(&halves[0], model, focal, from), || judged(&halves[1], model, focal, from));
@@ -549,7 +553,6 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, search: &Search) -> Estimate 
     let blank_worse_by = Worse::than(&nothing, &moving).by;
     let (still_worse_by, still_error) = (than_still.by, than_still.error());
     let here = fit(&all, model, chosen_focal, &start, 10);
-    let evidence = Evidence::new(frame, &all);
     let residual = evidence.misfit(&here);
     let numbers = here.poses.len() * (Chart::new(model, focal, w, h).free() + 1);
     let evidence = (mean_square(evidence.targets()) - residual) * all.len() as f64 / numbers as f64;
@@ -592,4 +595,24 @@ pub(super) fn model_of(tsf: &Tsf) -> Model {
 /// Pixels from the border within which a pose looks beyond the frame, at most a fifth of the shorter side.
 fn margin(tsf: &Tsf, size: (usize, usize)) -> usize {
     (reach(tsf, size).ceil() as usize + 3).min(size.0.min(size.1) / 5)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A coarse level may find a motion whose middle is far from where the frame lies: one pose there explains nothing, and that is no evidence for the motion.
+    #[test]
+    fn a_frame_in_place_is_compared_with_where_it_was_placed() {
+        let (w, h) = (150, 120);
+        let mut random = crate::random::Random::new(5, 0);
+        let levels: Vec<f32> = (0..256).map(|_| (0.6 * random.normal() as f32).exp()).collect();
+        let scene = Plane::from_fn(w, h, |x, y| levels[((x + y / 3) / 7 * 61 + (y + 100 - x / 5) / 6 * 17) % 256]);
+        let blurred = Plane::in_order(w, h, |x, y| scene.at(x, y) + 0.01 * random.normal() as f32);
+        let weight = scene.map(|_| 1e4);
+        let frame = WholeFrame { latent: &scene, pad: 0, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
+        let far = Tsf::new(180.0, vec![Pose::planar(0.0, 0.0, 0.0, 0.6), Pose::planar(24.0, -9.0, 0.0, 0.4)]).unwrap();
+        let found = choose(&frame, 0, &far, &Search { model: Model::Rigid, ..Search::default() });
+        assert!(found.still_worse_by < 0.05, "one pose is worse by {:.2}", found.still_worse_by);
+    }
 }
