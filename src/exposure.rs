@@ -111,6 +111,24 @@ impl Bracket {
         Self { frames: self.frames.iter().zip(times).map(|(f, exposure_time)| Frame { exposure_time, ..f.clone() }).collect() }
     }
 
+    /// Of each frame the part of `size` (width, height) whose first pixel is that of `corners`, one for each frame.
+    ///
+    /// # Panics
+    /// When a part leaves its frame.
+    #[must_use]
+    pub fn cropped(&self, corners: &[(usize, usize)], size: (usize, usize)) -> Self {
+        let part = |(f, &(x, y)): (&Frame, &(usize, usize))| Frame {
+            name: f.name.clone(),
+            intensity: f.intensity.crop(x, y, size.0, size.1),
+            levels: f.levels,
+            chroma_subsampled: f.chroma_subsampled,
+            lossy: f.lossy,
+            speed: f.speed,
+            exposure_time: f.exposure_time,
+        };
+        Self { frames: self.frames.iter().zip(corners).map(part).collect() }
+    }
+
     /// The frames in command-line order.
     pub fn frames(&self) -> &[Frame] {
         &self.frames

@@ -232,6 +232,14 @@ impl Rgb {
         Self(std::array::from_fn(|c| f(&self.0[c])))
     }
 
+    /// The `width` x `height` part whose first pixel is (x, y).
+    ///
+    /// # Panics
+    /// When the part leaves the image.
+    pub fn crop(&self, x: usize, y: usize, width: usize, height: usize) -> Self {
+        self.map_planes(|p| p.crop(x, y, width, height))
+    }
+
     /// Mean of the three channels.
     pub fn mean(&self) -> Plane {
         self.mean_of(Channels::ALL)

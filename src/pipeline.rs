@@ -30,6 +30,7 @@ mod report;
 mod shaken;
 mod solve;
 mod stationary;
+mod window;
 
 pub use blind::Blind;
 pub use engine::Engine;

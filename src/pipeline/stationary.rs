@@ -42,9 +42,24 @@ impl Run<'_> {
         self.solve_base(state).map(Some)
     }
 
-    /// Judgements of the frames `placed`, and those that are stationary: `first`, which shows enough, and each other one unless a motion explains it beside the one of these
-    /// that is nearest in exposure. Where it shows that this one moved, it is the first itself.
-    fn judge_in_pairs(&mut self, state: &mut State, mut first: usize, placed: &[usize]) -> Result<()> {
+    /// Judgements of the frames `placed`, and those that are stationary, placed anew beside the first of them.
+    fn judge_in_pairs(&mut self, state: &mut State, first: usize, placed: &[usize]) -> Result<()> {
+        let used = state.all();
+        let first = self.within_window(placed, |run| run.compare_in_pairs(state, first, placed))?;
+        let stationary = |i: &usize| state.judgements[*i].as_ref().is_some_and(|j| j.kind == Kind::Stationary);
+        let still: Vec<usize> = placed.iter().copied().filter(stationary).collect();
+        (state.still, state.shaken) = (vec![first], used.iter().copied().filter(|&i| i != first).collect());
+        self.lay_out(state)?;
+        let joined: Vec<usize> = still.iter().copied().filter(|&i| i != first).collect();
+        if !joined.is_empty() {
+            self.place_stationary(state, &joined)?;
+        }
+        Ok(())
+    }
+
+    /// Judgements of the frames `placed`: `first`, which shows enough, is stationary, and each other one unless a motion explains it beside the one of these that is nearest in exposure. Where it
+    /// shows that this one moved, it is the first itself. That is returned.
+    fn compare_in_pairs(&mut self, state: &mut State, mut first: usize, placed: &[usize]) -> Result<usize> {
         let used = state.all();
         let mut scenes: Vec<Option<Rgb>> = vec![None; self.bracket.frames().len()];
         for attempt in 1..=FIRSTS {
@@ -75,15 +90,7 @@ impl Run<'_> {
             let Some(i) = sharper else { break };
             first = i;
         }
-        let stationary = |i: &usize| state.judgements[*i].as_ref().is_some_and(|j| j.kind == Kind::Stationary);
-        let still: Vec<usize> = placed.iter().copied().filter(stationary).collect();
-        (state.still, state.shaken) = (vec![first], used.iter().copied().filter(|&i| i != first).collect());
-        self.lay_out(state)?;
-        let joined: Vec<usize> = still.iter().copied().filter(|&i| i != first).collect();
-        if !joined.is_empty() {
-            self.place_stationary(state, &joined)?;
-        }
-        Ok(())
+        Ok(first)
     }
 
     /// The frames `ids` but `i`, the nearest in exposure time to it first.
@@ -111,6 +118,15 @@ impl Run<'_> {
         };
         let (forward, backward) = (look(self, i, other)?, look(self, other, i)?);
         let (forward, backward) = rayon::join(|| forward.evidence(), || backward.evidence());
+        if std::env::var_os("DBG").is_some() {
+            for (a, b, e) in [(i, other, &forward), (other, i, &backward)] {
+                let e: Vec<String> = e
+                    .iter()
+                    .map(|e| e.map_or("none".into(), |e| format!("{:.4},{:.4},{:.3},{:.2}", e.still, e.still_error, e.blank, e.stroke)))
+                    .collect();
+                eprintln!("DBG pair {a} {b} {}", e.join(" "));
+            }
+        }
         Ok(Pair { forward, backward })
     }
 }

@@ -110,6 +110,19 @@ fn shaken_frames_are_told_from_sharp_ones() {
     }
 }
 
+/// Large frames are judged by a part of them, wherever the others lie.
+#[test]
+fn frames_larger_than_the_window_are_judged_by_a_part_of_them() {
+    let scene = synth::room(840, 560, 60, 3);
+    let displaced = |extent_px: f64, roll_deg: f64| Tremor { extent_px, roll_deg, offset_px: 18.0, offset_deg: 0.3 };
+    let times = [(0.05, None), (0.2, Some(displaced(0.0, 0.0))), (0.8, Some(displaced(7.0, 0.3)))];
+    let made = synth::capture(&scene, &Camera::default(), &times, 0.2, 11).unwrap();
+    let quick = deblur::Settings { outer: 1, prior: Prior::Tv, ..deblur::Settings::default() };
+    let found = merge(&made.bracket, &Settings { deblur: quick, between_pixels: false, ..Settings::default() }, None);
+    let moved: Vec<bool> = judgements(&found).iter().map(|j| j["kind"] == "moved").collect();
+    assert_eq!(moved, [false, false, true], "{:?}", judgements(&found));
+}
+
 #[test]
 fn what_moved_in_the_shaken_frame_does_no_harm() {
     let (made, without, with) = sound();
