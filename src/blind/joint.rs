@@ -531,15 +531,30 @@ pub struct Begun {
 /// [`at_coarsest`] from one start; the frame `still` does not move.
 fn from_start(level: &Level, start: &Start, still: Option<usize>, going: &mut dyn FnMut() -> bool) -> Option<State> {
     let mut state = level.begin(start);
-    for k in 0..ROUNDS.0 {
-        let t = (k + 1).saturating_sub(SEARCH) as f32 / (ROUNDS.0 - SEARCH) as f32;
-        level.round(&mut state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None, still);
-        if !going() {
-            return None;
-        }
-    }
-    level.settle(&mut state);
+    search(level, &mut state, still, going)?;
+    sharpen(level, &mut state, still, going)?;
     Some(state)
+}
+
+/// The rounds of [`from_start`] before smoothness falls.
+fn search(level: &Level, state: &mut State, still: Option<usize>, going: &mut dyn FnMut() -> bool) -> Option<()> {
+    for _ in 0..SEARCH {
+        level.round(state, SMOOTHNESS.0, MODEL_ERROR.0, None, still);
+        going().then_some(())?;
+    }
+    Some(())
+}
+
+/// Those in which smoothness and trust in the operators' errors fall.
+fn sharpen(level: &Level, state: &mut State, still: Option<usize>, going: &mut dyn FnMut() -> bool) -> Option<()> {
+    let rounds = ROUNDS.0 - SEARCH;
+    for k in 1..=rounds {
+        let t = k as f32 / rounds as f32;
+        level.round(state, between((SMOOTHNESS.0, 1.0), t), between(MODEL_ERROR, t), None, still);
+        going().then_some(())?;
+    }
+    level.settle(state);
+    Some(())
 }
 
 /// What speaks for it that a frame moved that was taken for stationary.
@@ -547,46 +562,57 @@ fn from_start(level: &Level, start: &Start, still: Option<usize>, going: &mut dy
 pub struct Doubt {
     /// Its blur where all frames may move, in pixels: length of an even stroke of the standard deviation along the blur beyond that across it. A soft lens has none.
     pub stroke_px: f64,
+    /// The same from which it may have moved.
+    pub line_px: f64,
     /// ln of the squared residual where it did not move over that where it did, on pixels that no part of the estimate has seen: of the frame itself and the mean of all; 0 where it has
     /// no stroke.
     pub explained: (f64, f64),
 }
 
-/// Stroke in pixels from which the only frame that was taken for stationary may have moved: behind soft lenses, sharp frames beside ones that moved had up to 1.1 in random brackets,
-/// frames blurred by 3 to 4 px from 1.5.
-pub const STROKE: f64 = 1.25;
+/// Stroke, in pixels of the coarsest level, from which a frame that was taken for stationary may have moved: behind soft lenses, sharp frames beside ones that moved had up to 0.55 in random
+/// brackets, frames blurred by 3 to 4 pixels of twice the size from 0.75.
+const STROKE: f64 = 0.625;
 
-/// The same where several frames were: one that pairs of frames would show as well. Sharp frames of random brackets had up to 1.5 that was founded, frames that moved by 4 px and more from
-/// 4.4.
-pub const STROKE_OF_SEVERAL: f64 = 2.0;
+/// Part of [`STROKE`] below which a frame's stroke does not come to more once smoothness falls.
+const BEGUN: f64 = 0.5;
 
 /// Squared residual where all frames moved over that of what is known without it, on pixels that no part of the estimate has seen, below which it is believed that they did.
 pub const EXPLAINED: f64 = 0.8;
 
 impl Doubt {
-    /// Whether it is worth to estimate all blurs together: the stroke is longer than `stroke` and the residual falls below [`EXPLAINED`] of what it was, of the frame itself and in the mean.
-    pub fn is_founded(&self, stroke: f64) -> bool {
-        self.stroke_px > stroke && self.explained.0.min(self.explained.1) > -EXPLAINED.ln()
+    /// Whether it is worth to estimate all blurs together: the stroke is longer than the line and the residual falls below [`EXPLAINED`] of what it was, of the frame itself and in the mean.
+    pub fn is_founded(&self) -> bool {
+        self.stroke_px > self.line_px && self.explained.0.min(self.explained.1) > -EXPLAINED.ln()
     }
 }
 
-/// Whether the frame of `start` may have moved, by a stroke longer than `stroke` in pixels, as well as all others, as the coarsest level tells, whatever the size of the frames; and what
-/// [`estimate`] can go on from. `None` when `going` returns `false`, which it is asked after each round.
-pub fn doubt(frames: &[Frame], start: &Start, stroke: f64, going: &mut dyn FnMut() -> bool) -> Option<(Doubt, Begun)> {
+/// Whether the frame of `start` may have moved as well as all others, as the coarsest level tells, and what [`estimate`] can go on from, where that is known. `None` when `going` returns `false`, which
+/// it is asked after each round.
+pub fn doubt(frames: &[Frame], start: &Start, going: &mut dyn FnMut() -> bool) -> Option<(Doubt, Option<Begun>)> {
     let level = Level::new(frames, coarsest(frames), false);
-    let moved = from_start(&level, start, None, going)?;
-    let c = moved.tsfs[start.reference].covariance();
-    let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
-    let stroke_px = (12.0 * beyond).sqrt() * level.scale as f64;
-    if stroke_px <= stroke {
-        return Some((Doubt { stroke_px, explained: (0.0, 0.0) }, Begun { state: moved }));
+    let line_px = STROKE * level.scale as f64;
+    let stroke = |state: &State| {
+        let c = state.tsfs[start.reference].covariance();
+        let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
+        (12.0 * beyond).sqrt() * level.scale as f64
+    };
+    let unfounded = |stroke_px: f64| Doubt { stroke_px, line_px, explained: (0.0, 0.0) };
+    let mut moved = level.begin(start);
+    search(&level, &mut moved, None, going)?;
+    if stroke(&moved) <= BEGUN * line_px {
+        return Some((unfounded(stroke(&moved)), None));
+    }
+    sharpen(&level, &mut moved, None, going)?;
+    let stroke_px = stroke(&moved);
+    if stroke_px <= line_px {
+        return Some((unfounded(stroke_px), Some(Begun { state: moved })));
     }
     let still = from_start(&level, start, Some(start.reference), going)?;
     let begun = Begun { state: moved };
     let (still, moved) = (level.judge(&still), level.judge(&begun.state));
     let ln = |still: f64, moved: f64| (still.max(1e-6) / moved.max(1e-6)).ln();
     let own = ln(still[start.reference], moved[start.reference]);
-    Some((Doubt { stroke_px, explained: (own, ln(geometric_mean(&still), geometric_mean(&moved))) }, begun))
+    Some((Doubt { stroke_px, line_px, explained: (own, ln(geometric_mean(&still), geometric_mean(&moved))) }, Some(begun)))
 }
 
 /// `state` of the level `from` on the next finer one, `level`, and `rounds` on from there. `None` as for [`at_coarsest`].
@@ -777,30 +803,40 @@ pub fn cross_validated(
 mod tests {
     use super::*;
 
+    const SIZE: (usize, usize) = (72, 60);
+    const PAD: usize = 12;
+    const NOISE: f32 = 0.02;
+
+    fn path(x: f64, y: f64, roll: f64) -> Tsf {
+        let at = |t: f64| Pose::planar(x * t, y * t - 0.8 * (t * t - 0.4), roll * t, 1.0);
+        Tsf::new(90.0, (0..9).map(|i| at(f64::from(i) / 4.0 - 1.0)).collect()).unwrap()
+    }
+
+    /// A scene with [`PAD`] pixels around it.
+    fn scene(random: &mut Random) -> Plane {
+        let levels: Vec<f32> = (0..256).map(|_| (0.6 * random.normal() as f32).exp()).collect();
+        Plane::from_fn(SIZE.0 + 2 * PAD, SIZE.1 + 2 * PAD, |x, y| levels[((x + y / 3) / 9 * 61 + (y + 100 - x / 5) / 7 * 17) % 256])
+    }
+
+    /// What a frame shows of it.
+    fn frame(scene: &Plane, tsf: &Tsf, random: &mut Random) -> Frame {
+        let (w, h) = SIZE;
+        let clean = Operator::new(tsf, w, h, PAD).blur(scene);
+        let blurred = Plane::in_order(w, h, |x, y| clean.at(x, y) + NOISE * random.normal() as f32);
+        Frame { variance: clean.map(|_| NOISE * NOISE), mask: clean.map(|_| 1.0), clipped: vec![false; w * h], blurred }
+    }
+
     /// From TSFs that are too short the steps lead to others that explain more; from the true ones only to the noise of the pixels held out in turn, which
     /// is not kept.
     #[test]
     fn cross_validation_keeps_what_explains_unseen_pixels_best() {
-        let (w, h) = (72, 60);
-        let path = |x: f64, y: f64, roll: f64| {
-            let at = |t: f64| Pose::planar(x * t, y * t - 0.8 * (t * t - 0.4), roll * t, 1.0);
-            Tsf::new(90.0, (0..9).map(|i| at(f64::from(i) / 4.0 - 1.0)).collect()).unwrap()
-        };
         let tsfs = |length: f64| [path(1.5 * length, 0.5, 0.3), path(-1.0, 2.5 * length, -0.3), path(3.5 * length, 1.5, 0.5)];
         let mut random = Random::new(7, 0);
-        let levels: Vec<f32> = (0..256).map(|_| (0.6 * random.normal() as f32).exp()).collect();
-        let pad = 12;
-        let scene = Plane::from_fn(w + 2 * pad, h + 2 * pad, |x, y| levels[((x + y / 3) / 9 * 61 + (y + 100 - x / 5) / 7 * 17) % 256]);
-        let noise = 0.02f32;
-        let mut frame = |tsf: &Tsf| {
-            let clean = Operator::new(tsf, w, h, pad).blur(&scene);
-            let blurred = Plane::in_order(w, h, |x, y| clean.at(x, y) + noise * random.normal() as f32);
-            Frame { variance: clean.map(|_| noise * noise), mask: clean.map(|_| 1.0), clipped: vec![false; w * h], blurred }
-        };
-        let frames: Vec<Frame> = tsfs(1.0).iter().map(&mut frame).collect();
+        let scene = scene(&mut random);
+        let frames: Vec<Frame> = tsfs(1.0).iter().map(|t| frame(&scene, t, &mut random)).collect();
         let level = Level::new(&frames, 1, true);
         let residuals = |length: f64| {
-            let mut state = level.placed(&scene.crop(pad, pad, w, h), &tsfs(length), 0);
+            let mut state = level.placed(&scene.crop(PAD, PAD, SIZE.0, SIZE.1), &tsfs(length), 0);
             level.settle(&mut state);
             let found = level.validated(&state, &[], STEPS.0, &mut || true).unwrap();
             [state, found].map(|s| geometric_mean(&level.judge(&s)))
@@ -812,8 +848,29 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_that_stood_still_is_soon_beyond_doubt_and_one_that_moved_is_not() {
+        let mut random = Random::new(9, 0);
+        let scene = scene(&mut random);
+        let asked = |first: &Tsf, random: &mut Random| {
+            let frames = [frame(&scene, first, random), frame(&scene, &path(-1.0, 3.5, -0.3), random)];
+            let start = Start { reference: 0, luminance: frames[0].blurred.clone() };
+            let mut rounds = 0;
+            let (doubt, begun) = doubt(&frames, &start, &mut || {
+                rounds += 1;
+                true
+            })
+            .unwrap();
+            (doubt.is_founded(), begun.is_some(), rounds, doubt.stroke_px)
+        };
+        let (founded, begun, rounds, stroke) = asked(&Tsf::identity(), &mut random);
+        assert!(!founded && !begun && rounds == SEARCH, "{founded} after {rounds} rounds, {stroke:.2} px");
+        let (founded, begun, rounds, stroke) = asked(&path(2.5, 0.5, 0.3), &mut random);
+        assert!(founded && begun && rounds == 2 * ROUNDS.0, "{founded} after {rounds} rounds, {stroke:.2} px");
+    }
+
+    #[test]
     fn a_doubt_needs_a_stroke_and_a_frame_that_is_explained_itself() {
-        let founded = |stroke_px: f64, own: f64, all: f64| Doubt { stroke_px, explained: (own, all) }.is_founded(STROKE);
+        let founded = |stroke_px: f64, own: f64, all: f64| Doubt { stroke_px, line_px: 1.25, explained: (own, all) }.is_founded();
         assert!(founded(2.0, 0.7, 0.3));
         assert!(!founded(0.8, 0.7, 0.3), "a soft lens");
         assert!(!founded(2.0, 0.03, 1.0), "the others are explained better, not the frame that is in doubt");

@@ -15,8 +15,7 @@ mod operator;
 mod patches;
 
 pub use joint::{
-    Begun, Doubt, FittedTo, Joint, Known, STROKE, STROKE_OF_SEVERAL, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp,
-    geometric_mean,
+    Begun, Doubt, FittedTo, Joint, Known, Stage, Start, Way, cross_validated, doubt, estimate, fits, fix_warp, geometric_mean,
 };
 pub use luminance::{Frame, luminance_of};
 pub use operator::Operator;

@@ -222,24 +222,29 @@ impl Run<'_> {
         Self::coloured(&self.blurred_merge(used), luminance, channels)
     }
 
-    /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved by more than `stroke` pixels as well as all others; `None` where
-    /// the edges of one of these are as hard as a sharp frame's.
-    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize], stroke: f64) -> Result<Option<(Doubt, Begun)>> {
+    /// What speaks for it that the frame `first`, one of those of the frames `used` that are taken for stationary (`still`), moved as well as all others, and what a joint estimate of them can go on
+    /// from; `None` where the edges of one of these are as hard as a sharp frame's.
+    pub(super) fn doubt(&mut self, first: usize, still: &[usize], used: &[usize]) -> Result<Option<(Doubt, Option<Begun>)>> {
         if !still.iter().all(|&i| self.hardness(i).is_some_and(|h| h < SOFT)) {
             return Ok(None);
         }
+        let reference = used.iter().position(|&i| i == first).unwrap_or(0);
+        let size = self.bracket.size();
         self.remembered(
             "doubt",
-            &format!("{first} {used:?} {stroke}"),
+            &format!("{first} {used:?}"),
             |_| 0,
             |run| {
-                let channels = run.most_telling(used, used);
-                let frames = run.luminance_frames(used, channels);
-                let reference = used.iter().position(|&i| i == first).unwrap_or(0);
-                let start = Start { reference, luminance: run.alone(first, channels) };
-                let stage = format!("looking whether {} moved as well", run.bracket.frames()[first].name);
-                let found = blind::doubt(&frames, &start, stroke, &mut || run.progress(&stage, 0.40).is_ok());
-                found.map(Some).ok_or(Error::Cancelled)
+                run.within_window(used, |part| {
+                    let channels = part.most_telling(used, used);
+                    let frames = part.luminance_frames(used, channels);
+                    let start = Start { reference, luminance: part.alone(first, channels) };
+                    let stage = format!("looking whether {} moved as well", part.bracket.frames()[first].name);
+                    let found = blind::doubt(&frames, &start, &mut || part.progress(&stage, 0.40).is_ok());
+                    let (doubt, begun) = found.ok_or(Error::Cancelled)?;
+                    // Of a part nothing is begun that the whole can go on from.
+                    Ok(Some((doubt, begun.filter(|_| part.bracket.size() == size))))
+                })
             },
         )
     }

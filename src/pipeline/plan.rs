@@ -5,7 +5,7 @@ use super::judge::{self, BlurEvidence, Judgement, Kind};
 use super::place::Placed;
 use super::shaken::{for_estimates, for_first_round};
 use super::{Outcome, Run};
-use crate::blind::{self, Begun};
+use crate::blind::Begun;
 use crate::deblur::{self, Solution};
 use crate::error::Result;
 use crate::image::Rgb;
@@ -201,18 +201,18 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Where the edges of all frames that are taken for stationary are soft, all frames may have moved: the joint estimate of all blurs, if that explains held-out pixels better.
+    /// Where the edges of all frames that are taken for stationary are soft and no two of them agree, all frames may have moved: the joint estimate of all blurs, if that explains held-out pixels
+    /// better. No two frames of one hand are blurred alike.
     fn doubt_the_stationary(&mut self, state: &mut State) -> Result<()> {
         let Some(first) = self.first_reference(&state.still) else { return Ok(()) };
         let asked = self.settings.blind == Blind::Auto && self.settings.sharp.is_none() && !state.given.contains(&true);
         let explained = state.shaken.iter().all(|&i| state.tsfs[i].is_some());
-        let stroke = if state.still.len() == 1 { blind::STROKE } else { blind::STROKE_OF_SEVERAL };
-        let doubt = if asked && explained { self.doubt(first, &state.still, &state.all(), stroke)? } else { None };
+        let agree = state.still.iter().any(|&i| state.judgements[i].as_ref().is_some_and(Judgement::agrees));
+        let doubt = if asked && explained && !agree { self.doubt(first, &state.still, &state.all())? } else { None };
         let Some((doubt, begun)) = doubt else { return Ok(()) };
-        let founded = doubt.is_founded(stroke);
-        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, stroke, founded));
-        if founded {
-            self.take_all_blurs(state, Some(&begun))?;
+        state.judgements[first] = Some(judge::doubted(doubt.stroke_px, doubt.line_px, doubt.is_founded()));
+        if doubt.is_founded() {
+            self.take_all_blurs(state, begun.as_ref())?;
             if state.still.is_empty() {
                 self.lay_out(state)?;
             }

@@ -22,6 +22,9 @@ pub(super) enum Kind {
     Excluded,
 }
 
+/// ln of a ratio of residuals: strokes of 3 px and more bring that much to frames that are not drowned in noise.
+const TOLD: f64 = 0.1;
+
 /// What was decided of a frame, and by how much.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Judgement {
@@ -59,6 +62,11 @@ impl Judgement {
         Self { kind: Kind::Stationary, compared: "nothing", value: None, line: None, margin: None, reason }
     }
 
+    /// Whether it is that of a stationary frame beside another one in which a motion that explains [`TOLD`] of it would have been seen.
+    pub fn agrees(&self) -> bool {
+        self.kind == Kind::Stationary && self.compared == pair::COMPARED && self.line.is_some_and(|line| line < TOLD)
+    }
+
     /// By on which side of `line` the `value` is.
     pub fn by(kind: Kind, compared: &'static str, value: f64, line: f64, reason: String) -> Self {
         Self { kind, compared, value: Some(value), line: Some(line), margin: Some((value - line).abs()), reason }
@@ -74,4 +82,18 @@ pub(super) fn doubted(stroke_px: f64, line: f64, founded: bool) -> Judgement {
         "no blur of its own explains the frames better".into()
     };
     Judgement::by(Kind::Stationary, "stroke in pixels of its own blur where all frames may move", stroke_px, line, reason)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_agree_where_a_motion_would_have_been_seen() {
+        let beside = |kind, line| Judgement::by(kind, pair::COMPARED, 0.01, line, String::new());
+        assert!(beside(Kind::Stationary, 0.08).agrees());
+        assert!(!beside(Kind::Stationary, 0.3).agrees(), "noise would hide it");
+        assert!(!beside(Kind::Moved, 0.08).agrees());
+        assert!(!Judgement::first().agrees() && !Judgement::untold().agrees(), "compared with nothing");
+    }
 }

@@ -80,7 +80,7 @@ impl Pair {
     }
 }
 
-const COMPARED: &str = "ln of the held-out residual of one pose, or of nothing, over that of a motion, less the same of the other frame beside this one, mean of three sizes";
+pub(super) const COMPARED: &str = "ln of the held-out residual of one pose, or of nothing, over that of a motion, less the same of the other frame beside this one, mean of three sizes";
 
 #[cfg(test)]
 mod tests {
