@@ -540,17 +540,19 @@ fn choose(frame: &WholeFrame, l: usize, tsf: &Tsf, search: &Search) -> Estimate 
     let halves = HeldOut::halves(&all, (w, h));
     let judged = |half: &HeldOut, model: Model, focal: f64, from: &Tsf| {
         let residual = filters.residual(frame, half, &fit(&half.inside, model, focal, from, TRIAL));
-        half.blocks_with_gains(&frame.targets(&half.outside), &residual)
+        (half.blocks_with_gains(&frame.targets(&half.outside), &residual), half.blocks(&residual))
     };
     let of_both = |model: Model, focal: f64, from: &Tsf| {
         let (mut first, second) = rayon::join(|| judged(&halves[0], model, focal, from), || judged(&halves[1], model, focal, from));
-        first.extend(second);
+        first.0.extend(second.0);
+        first.1.extend(second.1);
         first
     };
     let (in_place, moving) = rayon::join(|| of_both(Model::Rigid, focal, &one), || of_both(model, chosen_focal, &start));
     let nothing: Vec<_> = halves.iter().flat_map(|half| half.blocks(&frame.targets(&half.outside))).collect();
-    let than_still = Worse::than(&in_place, &moving);
-    let blank_worse_by = Worse::than(&nothing, &moving).by;
+    let than_still = Worse::than(&in_place.0, &moving.0);
+    // A gain of its own explains a part of any block.
+    let blank_worse_by = Worse::than(&nothing, &moving.1).by;
     let (still_worse_by, still_error) = (than_still.by, than_still.error());
     let here = fit(&all, model, chosen_focal, &start, 10);
     let residual = evidence.misfit(&here);
@@ -600,15 +602,15 @@ fn margin(tsf: &Tsf, size: (usize, usize)) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tsf::held_out::tests::scattered;
 
     /// A coarse level may find a motion whose middle is far from where the frame lies: one pose there explains nothing, and that is no evidence for the motion.
     #[test]
     fn a_frame_in_place_is_compared_with_where_it_was_placed() {
         let (w, h) = (150, 120);
-        let mut random = crate::random::Random::new(5, 0);
-        let levels: Vec<f32> = (0..256).map(|_| (0.6 * random.normal() as f32).exp()).collect();
+        let levels: Vec<f32> = (0..256).map(|i| (0.6 * scattered(11, i)).exp()).collect();
         let scene = Plane::from_fn(w, h, |x, y| levels[((x + y / 3) / 7 * 61 + (y + 100 - x / 5) / 6 * 17) % 256]);
-        let blurred = Plane::in_order(w, h, |x, y| scene.at(x, y) + 0.01 * random.normal() as f32);
+        let blurred = Plane::from_fn(w, h, |x, y| scene.at(x, y) + 0.01 * scattered(12, y * w + x));
         let weight = scene.map(|_| 1e4);
         let frame = WholeFrame { latent: &scene, pad: 0, blurred: &blurred, weight: &weight, base: DMat3::IDENTITY };
         let far = Tsf::new(180.0, vec![Pose::planar(0.0, 0.0, 0.0, 0.6), Pose::planar(24.0, -9.0, 0.0, 0.4)]).unwrap();

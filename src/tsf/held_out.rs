@@ -165,7 +165,7 @@ fn shares(columns: &[Vec<f32>], targets: &[f32]) -> Vec<f64> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::pose::Pose;
     use crate::tsf::Interpolation;
@@ -173,7 +173,7 @@ mod tests {
     use glam::DMat3;
 
     /// Numbers of mean 0 and standard deviation 1, evenly distributed, by a hash of their place.
-    fn scattered(seed: u32, i: usize) -> f32 {
+    pub fn scattered(seed: u32, i: usize) -> f32 {
         let mut v = (i as u32).wrapping_mul(0x9E37_79B9) ^ seed.wrapping_mul(0x85EB_CA6B);
         for _ in 0..2 {
             v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
