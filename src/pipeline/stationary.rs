@@ -118,15 +118,6 @@ impl Run<'_> {
         };
         let (forward, backward) = (look(self, i, other)?, look(self, other, i)?);
         let (forward, backward) = rayon::join(|| forward.evidence(), || backward.evidence());
-        if std::env::var_os("DBG").is_some() {
-            for (a, b, e) in [(i, other, &forward), (other, i, &backward)] {
-                let e: Vec<String> = e
-                    .iter()
-                    .map(|e| e.map_or("none".into(), |e| format!("{:.4},{:.4},{:.3},{:.2}", e.still, e.still_error, e.blank, e.stroke)))
-                    .collect();
-                eprintln!("DBG pair {a} {b} {}", e.join(" "));
-            }
-        }
         Ok(Pair { forward, backward })
     }
 }
