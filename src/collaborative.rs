@@ -402,7 +402,7 @@ pub fn filtered(image: &Rgb, precision: &Precision, strength: f32, progress: &mu
         let larger = |i: &Rgb| i.map_planes(|p| Plane::from_fn(w, h, |x, y| p.clamped(x as isize, y as isize)));
         let blurred = precision.blurred.iter().map(|(p, power)| (larger(p), power.clone())).collect();
         let precision = Precision { white: larger(&precision.white), blurred };
-        return filtered(&larger(image), &precision, strength, progress).map(|f| f.map_planes(|p| p.crop(0, 0, width, height)));
+        return filtered(&larger(image), &precision, strength, progress).map(|f| f.crop(0, 0, width, height));
     }
     let (dct, opponent) = (dct(), opponent());
     let noisy = mixed(image, &opponent);

@@ -256,36 +256,15 @@ pub fn merge_with(
     memo.begin(if given.is_some() { None } else { Some(format!("{name} {:?}", settings.noise)) });
     let Prepared { corrected, exposures, noise, curves, exposure_errors } = prepare::prepared(memo, bracket, response, settings);
     let bracket = corrected.as_ref().unwrap_or(bracket);
-    let n = bracket.frames().len();
     let repaired = OnceCell::new();
     let mut run = Run {
-        gpu,
-        kernels,
-        memo,
         stop,
-        bracket,
-        repaired: &repaired,
-        response,
-        settings,
-        events,
         timings: vec![("exposures and noise".into(), start.elapsed().as_secs_f64())],
         exposures,
         noise,
         curves,
-        photometry: vec![FramePhotometry::AS_NOTED; n],
         exposure_errors,
-        masks: Vec::new(),
-        ghosts: vec![None; n],
-        looks: Vec::new(),
-        pixel_sharp: false,
-        motions: vec![DMat3::IDENTITY; n],
-        registrations: vec![Registration::skipped(); n],
-        left_out: Vec::new(),
-        degraded: Vec::new(),
-        hot_pixels: 0,
-        blind: Value::Null,
-        aliasing: vec![None; n],
-        scale: 1.0,
+        ..Run::of(gpu, kernels, memo, bracket, &repaired, response, settings, events)
     };
     run.tell_of_exposures()?;
     run.reconstruct(excluded, given)
@@ -313,6 +292,51 @@ fn check(bracket: &Bracket, settings: &Settings) -> Result<Vec<bool>> {
         return Err(Error::Input(format!("patch {x},{y} lies outside the frames, which are {w} x {h} pixels counted from 0,0")));
     }
     Ok(excluded)
+}
+
+impl<'a> Run<'a> {
+    /// One in which nothing is known of the frames but their files.
+    fn of(
+        gpu: &'a Gpu,
+        kernels: &'a Kernels,
+        memo: &'a mut Memo,
+        bracket: &'a Bracket,
+        repaired: &'a OnceCell<Bracket>,
+        response: &'a Response,
+        settings: &'a Settings,
+        events: &'a mut dyn FnMut(Event) -> bool,
+    ) -> Self {
+        let n = bracket.frames().len();
+        Self {
+            gpu,
+            kernels,
+            memo,
+            stop: None,
+            bracket,
+            repaired,
+            response,
+            settings,
+            events,
+            timings: Vec::new(),
+            exposures: Vec::new(),
+            noise: Vec::new(),
+            curves: Vec::new(),
+            photometry: vec![FramePhotometry::AS_NOTED; n],
+            exposure_errors: Vec::new(),
+            masks: Vec::new(),
+            ghosts: vec![None; n],
+            looks: Vec::new(),
+            pixel_sharp: false,
+            motions: vec![DMat3::IDENTITY; n],
+            registrations: vec![Registration::skipped(); n],
+            left_out: Vec::new(),
+            degraded: Vec::new(),
+            hot_pixels: 0,
+            blind: Value::Null,
+            aliasing: vec![None; n],
+            scale: 1.0,
+        }
+    }
 }
 
 impl Run<'_> {

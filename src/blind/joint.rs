@@ -586,7 +586,7 @@ impl Doubt {
     }
 }
 
-/// Whether the frame of `start` may have moved as well as all others, as the coarsest level tells, and what [`estimate`] can go on from, where that is known. `None` when `going` returns `false`, which
+/// Whether the frame of `start` may have moved as well as all others, as the coarsest level tells, and what [`estimate`] can go on from, where it has a stroke. `None` when `going` returns `false`, which
 /// it is asked after each round.
 pub fn doubt(frames: &[Frame], start: &Start, going: &mut dyn FnMut() -> bool) -> Option<(Doubt, Option<Begun>)> {
     let level = Level::new(frames, coarsest(frames), false);
@@ -596,16 +596,16 @@ pub fn doubt(frames: &[Frame], start: &Start, going: &mut dyn FnMut() -> bool) -
         let beyond = (c.x_axis.x - c.y_axis.y).hypot(2.0 * c.x_axis.y);
         (12.0 * beyond).sqrt() * level.scale as f64
     };
-    let unfounded = |stroke_px: f64| Doubt { stroke_px, line_px, explained: (0.0, 0.0) };
+    let unfounded = |stroke_px: f64| Some((Doubt { stroke_px, line_px, explained: (0.0, 0.0) }, None));
     let mut moved = level.begin(start);
     search(&level, &mut moved, None, going)?;
     if stroke(&moved) <= BEGUN * line_px {
-        return Some((unfounded(stroke(&moved)), None));
+        return unfounded(stroke(&moved));
     }
     sharpen(&level, &mut moved, None, going)?;
     let stroke_px = stroke(&moved);
     if stroke_px <= line_px {
-        return Some((unfounded(stroke_px), Some(Begun { state: moved })));
+        return unfounded(stroke_px);
     }
     let still = from_start(&level, start, Some(start.reference), going)?;
     let begun = Begun { state: moved };

@@ -165,7 +165,7 @@ impl Solution {
     /// Irradiance on the frame's grid alone.
     pub fn cropped(&self) -> Rgb {
         let (w, h) = self.irradiance.size();
-        self.irradiance.map_planes(|p| p.crop(self.pad, self.pad, w - 2 * self.pad, h - 2 * self.pad))
+        self.irradiance.crop(self.pad, self.pad, w - 2 * self.pad, h - 2 * self.pad)
     }
 }
 

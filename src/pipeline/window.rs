@@ -90,37 +90,20 @@ impl Run<'_> {
     pub(super) fn within_window<T>(&mut self, ids: &[usize], f: impl FnOnce(&mut Run) -> Result<T>) -> Result<T> {
         let Some(size) = window_size(self.bracket.size()) else { return f(self) };
         let window = Window::of(self, ids, size);
-        let (whole, n) = (self.bracket.size(), self.bracket.frames().len());
+        let whole = self.bracket.size();
         let bracket = self.bracket.cropped(&window.corners, size);
         let (mut memo, repaired, settings) = (Memo::default(), OnceCell::new(), Settings { patches: Vec::new(), ..self.settings.clone() });
         let mut run = Run {
-            gpu: self.gpu,
-            kernels: self.kernels,
-            memo: &mut memo,
             stop: self.stop.clone(),
-            bracket: &bracket,
-            repaired: &repaired,
-            response: self.response,
-            settings: &settings,
-            timings: Vec::new(),
             exposures: self.exposures.iter().zip(&window.corners).map(|(e, c)| e.crop(c.0, c.1, size.0, size.1)).collect(),
             noise: self.noise.clone(),
             curves: self.curves.clone(),
             photometry: self.photometry.clone(),
             exposure_errors: self.exposure_errors.clone(),
-            masks: Vec::new(),
-            ghosts: vec![None; n],
-            looks: Vec::new(),
-            pixel_sharp: false,
             motions: self.motions.iter().enumerate().map(|(i, m)| window.motion(i, m, whole)).collect(),
             registrations: self.registrations.clone(),
-            left_out: Vec::new(),
-            degraded: Vec::new(),
-            hot_pixels: 0,
-            blind: serde_json::Value::Null,
-            aliasing: vec![None; n],
             scale: self.scale,
-            events: &mut *self.events,
+            ..Run::of(self.gpu, self.kernels, &mut memo, &bracket, &repaired, self.response, &settings, &mut *self.events)
         };
         let found = f(&mut run)?;
         self.timings.append(&mut run.timings);
